@@ -1,0 +1,56 @@
+"""The contract between an observer and whoever drives it (``node.py`` over Zenoh, ``simulation.py`` in one process).
+
+An observer is a pure step machine: no I/O, no clock, no randomness, numpy only. Step k goes
+
+    observer.sample(y, u)                  # data of step k
+    for r in range(observer.rounds):
+        out = observer.message(r)          # for every out-neighbour, the same vector
+        observer.exchange(r, received)     # {in-neighbour: vector}, ascending ids; under faults some may be missing
+    observer.estimate()                    # of x(k)
+
+The vector returned by ``message`` may be a buffer that the next call overwrites: senders copy it, receivers own theirs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from duio_mesh.arrays import Array
+
+NOTHING: Array = np.zeros(0)
+
+
+class Estimate(NamedTuple):
+    """What a node knows after a step."""
+
+    state: Array  # x-hat (n,)
+    unknown_input: Array = NOTHING  # w-hat (q,) where the method reconstructs it
+    noise: Array = NOTHING  # v-hat (r,) where the method reconstructs it
+
+
+class Observer(Protocol):
+    """One node's step machine."""
+
+    @property
+    def rounds(self) -> int:
+        """Exchanges in the current step; read after ``sample`` (a step with a set-up phase may have more)."""
+        ...
+
+    def sample(self, y: Array, u: Array) -> None:
+        """Take y_i(k) (p,) and the known inputs u_i(k) (m,)."""
+        ...
+
+    def message(self, r: int) -> Array:
+        """The vector for the neighbours in round r."""
+        ...
+
+    def exchange(self, r: int, received: Mapping[int, Array]) -> None:
+        """Use the neighbours' vectors of round r, in ascending order of id."""
+        ...
+
+    def estimate(self) -> Estimate:
+        """The estimate of x(k), valid once the step's exchanges are done; zeros of the right sizes before step 0."""
+        ...

@@ -1,0 +1,178 @@
+"""What a topology file says once it is read: plain frozen tuples and arrays, no file positions, no parsing.
+
+Letters are the papers': ``x+ = A x + B u + E w`` (or ``dx/dt``), ``y_i = C_i x + F_i v_i``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal, NamedTuple, TypeAlias
+
+import numpy as np
+
+from duio_mesh.arrays import Array
+
+Signal: TypeAlias = tuple[Mapping[str, Mapping[str, float]], ...]
+"""A sum of terms, each ``{kind: parameters}``; ``duio_mesh.dynamics.signal`` evaluates it. () is zero."""
+
+
+class Normal(NamedTuple):
+    """Initial state drawn from N(mean, diag(std)^2), one draw per run from the run's seed."""
+
+    mean: Array  # (n,)
+    std: Array  # (n,)
+
+
+class Lqr(NamedTuple):
+    """u = F (x - reference) with F the LQR gain of (A, B) for these weights."""
+
+    Q: Array  # (n, n)
+    R: Array  # (m, m)
+    reference: Array  # (n,)
+
+
+class Feedback(NamedTuple):
+    """u = F (x - reference), F as given."""
+
+    F: Array  # (m, n)
+    reference: Array  # (n,)
+
+
+class OpenLoop(NamedTuple):
+    """u_j = signals[j](t); one signal per input."""
+
+    signals: tuple[Signal, ...]
+
+
+class Noise(NamedTuple):
+    """v of y = C x + F v: ``channel`` F (p, r) and one signal per channel column. r = 0 is no noise."""
+
+    channel: Array  # (p, r)
+    signals: tuple[Signal, ...]  # r of them
+
+
+@dataclass(frozen=True)
+class Plant:
+    """The plant: (A, B, E), its inputs' names, and what drives it."""
+
+    time: Literal["discrete", "continuous"]
+    step: float  # seconds between samples: the plant's ``period`` or, in continuous time, the run's ``step``
+    A: Array  # (n, n)
+    B: Array  # (n, m)
+    E: Array  # (n, q)
+    inputs: tuple[str, ...]  # m names, the columns of B
+    x0: Array | Normal  # (n,)
+    control: Lqr | Feedback | OpenLoop
+    disturbance: tuple[Signal, ...]  # q of them
+
+    @property
+    def n(self) -> int:
+        """Number of states."""
+        return int(self.A.shape[0])
+
+
+@dataclass(frozen=True)
+class Node:
+    """One sensor: y_i = C_i x + F_i v_i, and the inputs it is told."""
+
+    id: int
+    C: Array  # (p, n)
+    knows: tuple[str, ...]
+    noise: Noise
+
+
+class Arc(NamedTuple):
+    """``source`` tells ``target`` with weight a_target,source > 0."""
+
+    source: int
+    target: int
+    weight: float
+
+
+@dataclass(frozen=True)
+class Graph:
+    """Who tells whom. An undirected edge is two arcs."""
+
+    ids: tuple[int, ...]  # sorted
+    arcs: tuple[Arc, ...]  # sorted by (source, target), no duplicates, no self-loops
+    directed: bool
+
+    def hears(self, i: int) -> dict[int, float]:
+        """In-neighbours j of node i with their weights a_ij, in ascending order of j."""
+        return {a.source: a.weight for a in self.arcs if a.target == i}
+
+    def tells(self, i: int) -> tuple[int, ...]:
+        """Out-neighbours of node i, ascending."""
+        return tuple(a.target for a in self.arcs if a.source == i)
+
+    def laplacian(self) -> Array:
+        """(N, N) in the order of ``ids``: L = diag(row sums of W) - W with W[i, j] = a_ij (i hears j)."""
+        at = {i: k for k, i in enumerate(self.ids)}
+        W = np.zeros((len(self.ids), len(self.ids)))
+        for source, target, weight in self.arcs:
+            W[at[target], at[source]] = weight
+        return np.diag(W.sum(axis=1)) - W
+
+    def islands(self) -> tuple[tuple[int, ...], ...]:
+        """Weakly connected components, each sorted, in the order of their smallest id."""
+        left, found = set(self.ids), []
+        touching: dict[int, set[int]] = {i: set() for i in self.ids}
+        for source, target, _ in self.arcs:
+            touching[source].add(target)
+            touching[target].add(source)
+        for start in self.ids:
+            if start not in left:
+                continue
+            island, front = {start}, [start]
+            while front:
+                for j in touching[front.pop()] - island:
+                    island.add(j)
+                    front.append(j)
+            left -= island
+            found.append(tuple(sorted(island)))
+        return tuple(found)
+
+
+class Convergence(NamedTuple):
+    """The verdict: every node's RMS error over the last fraction of the run is below ``rms_below``."""
+
+    rms_below: float
+    over_last: float
+
+
+@dataclass(frozen=True)
+class Run:
+    """How long, from which seed, and when a wait counts as a failure."""
+
+    steps: int
+    seed: int
+    convergence: Convergence
+    deadline: float  # seconds a process waits for a message before the run fails
+    window: int  # steps that the plant may be ahead of the slowest node
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """A whole topology file, resolved."""
+
+    name: str
+    description: str
+    plant: Plant
+    method: str
+    options: Any  # the method's own ``Options`` (synthesis/<method>.py)
+    nodes: Mapping[int, Node]  # ascending ids
+    graph: Graph
+    run: Run
+    document: Mapping[str, Any] = field(repr=False)  # the resolved file as plain data: what scenario.yaml is made of
+
+    def known(self, i: int) -> Array:
+        """B_i (n, m_i): columns of B whose inputs node i is told, in the order of ``plant.inputs``."""
+        names = set(self.nodes[i].knows)
+        return self.plant.B[:, [j for j, name in enumerate(self.plant.inputs) if name in names]]
+
+    def unknown(self, i: int) -> Array:
+        """[B_i^u, E] (n, m - m_i + q): every input that node i is not told (seed 000, below (5))."""
+        names = set(self.nodes[i].knows)
+        hidden = self.plant.B[:, [j for j, name in enumerate(self.plant.inputs) if name not in names]]
+        return np.hstack([hidden, self.plant.E])

@@ -1,0 +1,81 @@
+"""The oracle: the same plant and observers in one process, without Zenoh. The mesh must equal it bit for bit."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from duio_mesh.arrays import Array
+from duio_mesh.dynamics import Plant
+from duio_mesh.observers import make_observer
+from duio_mesh.synthesis.design import Design
+
+
+@dataclass(frozen=True)
+class Trace:
+    """A run as arrays: what trace.npz holds. Rows that a lost process never wrote are NaN."""
+
+    t: Array  # (K,) seconds
+    x: Array  # (K, n) the truth
+    node_ids: NDArray[np.int64]  # (N,)
+    xhat: Array  # (N, K, n), xhat[i, k] estimates x[k]
+    what: Array | None = None  # (N, K, q) where the method reconstructs the unknown input
+    vhat: dict[int, Array] = field(default_factory=dict)  # node id -> (K, r) where it reconstructs its noise
+
+    def arrays(self) -> dict[str, NDArray[np.generic]]:
+        """The arrays under the names of trace.npz."""
+        named: dict[str, NDArray[np.generic]] = {"t": self.t, "x": self.x, "node_ids": self.node_ids, "xhat": self.xhat}
+        if self.what is not None:
+            named["what"] = self.what
+        return named | {f"vhat_{i}": v for i, v in self.vhat.items()}
+
+
+def simulate(design: Design, progress: Callable[[int], None] = lambda _: None) -> Trace:
+    """Run plant and observers in lockstep; ``progress`` is called with the number of finished steps."""
+    plant = Plant(design.plant)
+    observers = {i: make_observer(spec) for i, spec in design.nodes.items()}
+    truth, rows = [], {i: list[Array]() for i in observers}
+    for k in range(design.plant.steps):
+        data = plant.sample()
+        truth.append(plant.x)
+        for i, observer in observers.items():
+            p = design.nodes[i].p
+            observer.sample(data[i][:p], data[i][p:])
+        for r in range(max(o.rounds for o in observers.values())):
+            sent = {i: o.message(r).copy() for i, o in observers.items()}
+            for i, observer in observers.items():
+                observer.exchange(r, {j: sent[j] for j in design.nodes[i].hears})
+        for i, observer in observers.items():
+            rows[i].append(np.concatenate(observer.estimate()))
+        plant.advance()
+        progress(k + 1)
+    return split_trace(design, np.array(truth), {i: np.array(r) for i, r in rows.items()})
+
+
+def split_trace(design: Design, x: Array, rows: dict[int, Array]) -> Trace:
+    """Cut every node's rows [x-hat | w-hat | v-hat] (K, size) into the named arrays of a trace."""
+    n, ids = design.scenario.plant.n, sorted(rows)
+    q, r = _reconstructs(design)
+    xhat = np.stack([rows[i][:, :n] for i in ids])
+    return Trace(
+        t=np.arange(x.shape[0], dtype=np.float64) * design.plant.step,
+        x=x,
+        node_ids=np.array(ids, dtype=np.int64),
+        xhat=xhat,
+        what=np.stack([rows[i][:, n : n + q] for i in ids]) if q else None,
+        vhat={i: rows[i][:, n + q :] for i in ids if r[i]},
+    )
+
+
+def _reconstructs(design: Design) -> tuple[int, dict[int, int]]:
+    """(q, {node: r_i}) that the method's estimates carry beside the state."""
+    sizes = {i: make_observer(spec).estimate() for i, spec in design.nodes.items()}
+    return max(e.unknown_input.size for e in sizes.values()), {i: e.noise.size for i, e in sizes.items()}
+
+
+def estimate_sizes(design: Design) -> dict[int, int]:
+    """Floats in one estimate row of each node."""
+    return {i: sum(part.size for part in make_observer(s).estimate()) for i, s in design.nodes.items()}

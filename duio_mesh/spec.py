@@ -1,0 +1,154 @@
+"""What one process is given, and its file form.
+
+Design is global, running is local: a ``NodeSpec`` holds one node's matrices, its neighbours' names and weights, and
+where to listen. It holds no other node's C, no Laplacian and no truth. The file is msgpack with a closed set of types;
+reading one can build nothing but the tuples below.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, TypeAlias, TypeVar
+
+import msgpack
+import numpy as np
+
+from duio_mesh.arrays import Array, contiguous
+
+Signals: TypeAlias = tuple[Any, ...]  # plain data: see duio_mesh.dynamics.signal
+
+
+@dataclasses.dataclass(frozen=True)
+class Wire:
+    """Where a process listens and whom it dials; filled in by the launcher (or an operator) when a run starts."""
+
+    run: str  # the run's name on the wire, unique per run
+    listen: tuple[str, ...]  # Zenoh endpoints, e.g. tcp/127.0.0.1:7447
+    connect: tuple[str, ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class NodeSpec:
+    """One sensor process."""
+
+    id: int
+    method: str  # names duio_mesh.observers.<method>
+    n: int  # states
+    p: int  # measurements in y_i
+    m: int  # known inputs in u_i
+    matrices: Mapping[str, Array]  # the method's own, C-contiguous
+    options: Mapping[str, Any]  # the method's own scalars
+    hears: Mapping[int, float]  # in-neighbours and weights a_ij
+    tells: tuple[int, ...]  # out-neighbours
+    steps: int
+    deadline: float  # seconds to wait for any one message
+    credit: int  # report progress to the plant every this many steps
+    output: str = ""  # file of this node's own estimates, float64 rows; "" keeps none
+    wire: Wire | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class SensorSpec:
+    """What the plant needs to measure for one node: y_i = C_i x + F_i v_i, u_i = u[known]."""
+
+    id: int
+    C: Array  # (p, n)
+    known: tuple[int, ...]  # columns of B
+    channel: Array  # F_i (p, r)
+    noise: Signals  # r signals
+
+
+@dataclasses.dataclass(frozen=True)
+class PlantSpec:
+    """The plant process: an exact recursion, its drives, and its sensors."""
+
+    time: str  # discrete | continuous
+    step: float  # seconds between samples
+    matrices: Mapping[str, Array]  # A, B, E; continuous plants add their exact propagators
+    x0: Mapping[str, Array]  # {"value": (n,)} or {"mean": (n,), "std": (n,)}
+    feedback: Mapping[str, Array]  # {"F": (m, n), "reference": (n,)}; {} when the control is open loop
+    control: Signals  # m signals when open loop, else ()
+    disturbance: Signals  # q signals
+    sensors: tuple[SensorSpec, ...]
+    seed: int
+    steps: int
+    window: int  # steps it may be ahead of the slowest node
+    deadline: float
+    output: str = ""  # file of the true state, float64 rows
+    wire: Wire | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class RecorderSpec:
+    """The recorder process: whom it listens to and what it writes."""
+
+    name: str
+    n: int
+    sizes: Mapping[int, int]  # node id -> floats per estimate row (n, plus what a method reconstructs)
+    arcs: tuple[tuple[int, int], ...]
+    step: float  # seconds between samples
+    steps: int
+    recording: str  # path of recording.rrd
+    live: bool
+    description: str  # markdown for the recording's first tab
+    truth: str  # the plant's output file and ...
+    estimates: Mapping[int, str]  # ... the nodes': rows that never arrived are read from here at the end
+    wire: Wire | None = None
+
+
+Spec = TypeVar("Spec", NodeSpec, PlantSpec, RecorderSpec)
+
+_TYPES: dict[str, type[Any]] = {t.__name__: t for t in (Wire, NodeSpec, SensorSpec, PlantSpec, RecorderSpec)}
+_ARRAY, _RECORD = 1, 2  # msgpack extension codes
+
+
+def _pack(value: Any) -> Any:
+    if isinstance(value, np.ndarray):
+        a = contiguous(value).astype("<f8", copy=False)
+        return msgpack.ExtType(_ARRAY, msgpack.packb([list(a.shape), a.tobytes()]))
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        fields = {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}
+        return msgpack.ExtType(_RECORD, msgpack.packb([type(value).__name__, fields], default=_pack))
+    if isinstance(value, Mapping):
+        return dict(value)
+    if isinstance(value, np.generic):
+        return value.item()
+    raise TypeError(f"a spec cannot hold a {type(value).__name__}")
+
+
+def _unpack(code: int, data: bytes) -> Any:
+    if code == _ARRAY:
+        shape, raw = msgpack.unpackb(data)
+        return contiguous(np.frombuffer(raw, dtype="<f8").reshape(shape))
+    if code == _RECORD:
+        name, fields = _load(data)
+        return _TYPES[name](**fields)
+    raise ValueError(f"unknown extension {code} in a spec")
+
+
+def _load(data: bytes) -> Any:
+    return msgpack.unpackb(data, ext_hook=_unpack, use_list=False, strict_map_key=False)
+
+
+def write_spec(spec: NodeSpec | PlantSpec | RecorderSpec, path: Path) -> None:
+    """Write ``spec`` readable by its owner only (mode 0600)."""
+    data = msgpack.packb(spec, default=_pack)
+    with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "wb") as f:
+        f.write(data)
+
+
+def read_spec(path: Path, kind: type[Spec]) -> Spec:
+    """Read a spec of this kind.
+
+    Raises ValueError when the file holds something else, OSError when it cannot be read.
+    """
+    try:
+        spec = _load(path.read_bytes())
+    except (ValueError, KeyError, TypeError, msgpack.UnpackException) as e:
+        raise ValueError(f"{path} is not a spec file: {e}") from None
+    if not isinstance(spec, kind):
+        raise ValueError(f"{path} holds a {type(spec).__name__}, not a {kind.__name__}")
+    return spec

@@ -1,0 +1,28 @@
+"""Offline: the global design. Sees the whole scenario, hands each node only its own. One file per method."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable
+from typing import Any
+
+from duio_mesh.scenario.model import Scenario
+from duio_mesh.synthesis.design import Design
+
+__all__ = ["Design", "options_of", "synthesise"]
+
+
+def options_of(method: str) -> type[Any]:
+    """The pydantic model of what may stand under ``observer:`` for this method."""
+    model: type[Any] = importlib.import_module(f"duio_mesh.synthesis.{method}").Options
+    return model
+
+
+def synthesise(scenario: Scenario, progress: Callable[[str], None] = lambda _: None) -> Design:
+    """Check the theory's conditions and design every gain.
+
+    ``progress`` is called with a short sentence before each long piece of work.
+    Raises DesignError when a condition fails or no gains exist; the message says which, where and by how much.
+    """
+    design: Design = importlib.import_module(f"duio_mesh.synthesis.{scenario.method}").design(scenario, progress)
+    return design
