@@ -30,6 +30,9 @@ class Wire:
     connect: tuple[str, ...]
 
 
+UNWIRED = Wire("", (), ())
+
+
 @dataclasses.dataclass(frozen=True)
 class NodeSpec:
     """One sensor process."""
@@ -45,9 +48,10 @@ class NodeSpec:
     tells: tuple[int, ...]  # out-neighbours
     steps: int
     deadline: float  # seconds to wait for any one message
+    window: int  # steps that the plant may be ahead of the slowest node
     credit: int  # report progress to the plant every this many steps
     output: str = ""  # file of this node's own estimates, float64 rows; "" keeps none
-    wire: Wire | None = None
+    wire: Wire = UNWIRED
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,7 +82,7 @@ class PlantSpec:
     window: int  # steps it may be ahead of the slowest node
     deadline: float
     output: str = ""  # file of the true state, float64 rows
-    wire: Wire | None = None
+    wire: Wire = UNWIRED
 
 
 @dataclasses.dataclass(frozen=True)
@@ -96,7 +100,7 @@ class RecorderSpec:
     description: str  # markdown for the recording's first tab
     truth: str  # the plant's output file and ...
     estimates: Mapping[int, str]  # ... the nodes': rows that never arrived are read from here at the end
-    wire: Wire | None = None
+    wire: Wire = UNWIRED
 
 
 Spec = TypeVar("Spec", NodeSpec, PlantSpec, RecorderSpec)

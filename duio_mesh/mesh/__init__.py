@@ -1,0 +1,12 @@
+"""Zenoh: sessions, key expressions, frames, the start barrier and waiting. The only place that imports zenoh.
+
+It knows frames and names, not observers: floats go in and come out with a step and a round.
+"""
+
+from __future__ import annotations
+
+from duio_mesh.mesh.frames import Encoder, Frame, Rejected, decode
+from duio_mesh.mesh.keys import Keys
+from duio_mesh.mesh.session import Mesh, Outlet, Source
+
+__all__ = ["Encoder", "Frame", "Keys", "Mesh", "Outlet", "Rejected", "Source", "decode"]

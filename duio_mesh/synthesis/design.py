@@ -44,6 +44,7 @@ def node_spec(
         tells=scenario.graph.tells(i),
         steps=run.steps,
         deadline=run.deadline,
+        window=run.window,
         credit=max(1, run.window // 4),
     )
 

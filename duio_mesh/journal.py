@@ -1,0 +1,72 @@
+"""A process' own rows (estimates, or true states): to its file always, to the recorder when there is one."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+
+from duio_mesh.arrays import Array
+from duio_mesh.mesh import Outlet
+
+PERIOD = 0.05  # seconds between batches: a viewer's eye, and cheap
+BATCH_BYTES = 1 << 16
+
+
+class Journal:
+    """Collects rows of ``size`` float64 and passes them on in batches: appended to ``path``, sent on ``outlet``.
+
+    The file is what a run's trace is made of; the network only shows it sooner. So the outlet may drop a batch, and a
+    recorder that is slow, frozen or dead costs nothing.
+    """
+
+    def __init__(self, path: str, size: int, outlet: Outlet) -> None:
+        self._file = Path(path).open("ab") if path else None  # noqa: SIM115  (closed in __exit__)
+        self._outlet = outlet
+        self._rows = np.empty((max(1, BATCH_BYTES // (8 * max(1, size))), size))
+        self._filled, self._first = 0, 0
+        self._due = time.monotonic() + PERIOD
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+        self.flush()
+        if self._file:
+            self._file.close()
+
+    def add(self, parts: Iterable[Array]) -> None:
+        """Append one row, given as its consecutive parts."""
+        row, at = self._rows[self._filled], 0
+        for part in parts:
+            if part.size:
+                row[at : at + part.size] = part
+                at += part.size
+        self._filled += 1
+        if self._filled == len(self._rows) or time.monotonic() >= self._due:
+            self.flush()
+
+    def flush(self) -> None:
+        """Pass on what is there."""
+        self._due = time.monotonic() + PERIOD
+        if not self._filled:
+            return
+        rows = self._rows[: self._filled]
+        if self._file:
+            self._file.write(rows.astype("<f8", copy=False).tobytes())
+            self._file.flush()
+        self._outlet.send(self._first, 0, rows)
+        self._first += self._filled
+        self._filled = 0
+
+
+def read_rows(path: str | Path, size: int) -> Array:
+    """The whole rows (K, size) of a journal file; a row cut short by a crash is left out, no file is no rows."""
+    if not Path(path).exists():
+        return np.zeros((0, size))
+    data = np.fromfile(path, dtype="<f8")
+    return data[: data.size - data.size % size].reshape(-1, size)

@@ -1,0 +1,232 @@
+"""One Zenoh peer per process: links only where the graph has edges, and waits that always end.
+
+Receiving: a callback on Zenoh's own thread puts the raw bytes into one queue per process; everything else happens on
+the main thread, in ``Mesh.get``. A peer that disappears is put into the same queue, behind everything it had sent.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import os
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable
+from queue import Empty, SimpleQueue
+from types import TracebackType
+from typing import Any, Self, TypeAlias
+
+# Before the first zenoh.open: all of Zenoh's work on one thread, except sending, which keeps its own (handing that over
+# as well can deadlock). About 1.3 times the rounds per second of the default runtime, and 4 threads instead of 9.
+os.environ.setdefault(
+    "ZENOH_RUNTIME", "(acc:(handover:app),rx:(handover:app),net:(handover:app),app:(worker_threads:1))"
+)
+
+import zenoh
+
+from duio_mesh.arrays import Array
+from duio_mesh.errors import RunError
+from duio_mesh.mesh.frames import Encoder, Frame, Rejected, decode, prefix
+from duio_mesh.mesh.keys import Keys
+from duio_mesh.spec import Wire
+
+Ready: TypeAlias = tuple[int | str, int | str]  # (source, target) of a link, for the start barrier
+START = 30.0  # seconds for all processes of a run to find each other
+
+
+def _config(wire: Wire) -> zenoh.Config:
+    """Peer mode, these endpoints and no others: no multicast, no gossip, no shared memory (payloads are small)."""
+    config = zenoh.Config()
+    settings: dict[str, Any] = {
+        "mode": "peer",
+        "listen/endpoints": list(wire.listen),
+        "connect/endpoints": list(wire.connect),
+        "connect/retry": {"period_init_ms": 10, "period_max_ms": 100, "period_increase_factor": 1.5},
+        "connect/timeout_ms": int(START * 1000),
+        "connect/exit_on_failure": True,
+        "open/return_conditions/connect_scouted": False,  # else every open waits half a second for scouting
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        "transport/shared_memory/enabled": False,
+    }
+    for key, value in settings.items():
+        config.insert_json5(key, json.dumps(value))
+    return config
+
+
+class Source:
+    """One incoming key: who sends on it, what it has sent, and what of it was refused."""
+
+    def __init__(self, name: str, who: str, expected: bytes) -> None:
+        self.name = name  # as the user knows it: "edge 3 -> 2"
+        self.who = who  # the process: "node-3"
+        self.expected = expected
+        self.last: tuple[int, int] | None = None  # (k, r) of the newest good frame
+        self.rejected: Counter[str] = Counter()
+        self.gone = False
+        self.taken = (-1, -1)  # newest (k, r) that was used: see lockstep.py
+        self.waiting: dict[tuple[int, int], Array] = {}  # good frames that are not due yet
+
+    def doing(self) -> str:
+        """What the other side last did, for messages to people."""
+        parts = ["it has gone"] if self.gone else []
+        parts.append(
+            "it sent nothing yet" if self.last is None else "it last sent step {}, round {}".format(*self.last)
+        )
+        parts += [f"{n} of its frames were refused ({cause})" for cause, n in self.rejected.items()]
+        return "; ".join(parts)
+
+
+class Outlet:
+    """One or more outgoing keys that carry the same frames."""
+
+    def __init__(self, encoder: Encoder, publishers: list[Any]) -> None:
+        self._encode, self._publishers = encoder, publishers
+        self.frames = 0
+
+    def send(self, k: int, r: int, vector: Array) -> None:
+        """Send the vector of step k, round r on every key. Blocks while a peer's queue is full (BLOCK keys only)."""
+        frame = self._encode(k, r, vector)
+        for publisher in self._publishers:
+            publisher.put(frame)
+        self.frames += len(self._publishers)
+
+
+class Mesh:
+    """The Zenoh side of one process; a context manager.
+
+    Declare sources and outlets, then ``meet`` (the start barrier), then ``get`` and ``send``.
+    """
+
+    def __init__(self, wire: Wire, who: str, warn: Callable[[str], None] = lambda _: None) -> None:
+        """Open the session. Raises RunError when an endpoint cannot be used or reached."""
+        self.who, self.keys = who, Keys(wire.run)
+        self._warn = warn
+        self._queue: SimpleQueue[tuple[Source | str, bytes | None]] = SimpleQueue()
+        self._sources: list[Source] = []
+        self._meeting: dict[str, Any] = {}  # name of a link -> publisher that must match before the start
+        self._kept: list[Any] = []
+        self._pinned: set[int] = set()
+        try:
+            self._session = zenoh.open(_config(wire))
+        except zenoh.ZError as e:
+            raise RunError(
+                f"{who} could not open its links (listen {wire.listen}, connect {wire.connect}): {e}"
+            ) from None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+        self._session.close()  # always: a live subscriber would keep the interpreter from ever exiting
+
+    # -- declaring --------------------------------------------------------------------------------------------------
+
+    def hear(self, key: str, name: str, who: str, ready: Ready | None = None) -> Source:
+        """Subscribe to ``key``, on which the process ``who`` sends; ``ready`` names the link for the start barrier."""
+        source = Source(name, who, prefix(self.keys.run, who))
+        self._sources.append(source)
+        put, pin = self._queue.put, self._pin
+
+        def arrived(sample: Any) -> None:
+            pin()
+            put((source, sample.payload.to_bytes()))
+
+        self._kept.append(self._session.declare_subscriber(key, zenoh.handlers.Callback(arrived, indirect=False)))
+        if ready:  # after the data subscriber, on the same link: whoever sees this one can be heard
+            self._kept.append(self._session.declare_subscriber(self.keys.ready(*ready), lambda _: None))
+        return source
+
+    def speak(self, links: Iterable[tuple[str, str, Ready | None]], drop: bool = False) -> Outlet:
+        """Publish on every (key, name, ready) of ``links``; with ``drop`` a slow receiver costs frames, not our time."""
+        publishers = []
+        for key, name, ready in links:
+            control = zenoh.CongestionControl.DROP if drop else zenoh.CongestionControl.BLOCK
+            publishers.append(self._session.declare_publisher(key, congestion_control=control, express=False))
+            if ready:
+                self._meeting[name] = self._session.declare_publisher(self.keys.ready(*ready))
+        return Outlet(Encoder(self.keys.run, self.who), publishers)
+
+    def watch(self, changed: Callable[[str, bool], None] | None = None) -> None:
+        """Announce this process and notice when a directly linked one comes or goes (``changed(who, alive)``)."""
+        self._kept.append(self._session.liveliness().declare_token(self.keys.alive(self.who)))
+        put, start = self._queue.put, len(self.keys.alive(""))
+
+        def seen(sample: Any) -> None:
+            who, alive = str(sample.key_expr)[start:], sample.kind == zenoh.SampleKind.PUT
+            if changed:
+                changed(who, alive)
+            if not alive:
+                put((who, None))
+
+        everyone = self.keys.alive("*")
+        self._kept.append(self._session.liveliness().declare_subscriber(everyone, seen, history=True))
+
+    def _pin(self) -> None:
+        """Keep this Zenoh thread's Python thread state: PyO3 otherwise makes and frees one for every message.
+
+        Worth a factor of two in rounds per second; the interpreter still exits cleanly because the session is closed.
+        """
+        ident = threading.get_ident()
+        if ident not in self._pinned:
+            self._pinned.add(ident)
+            ctypes.pythonapi.PyGILState_Ensure()
+
+    # -- the start barrier ------------------------------------------------------------------------------------------
+
+    def meet(self, timeout: float = START) -> None:
+        """Wait until every link of this process has somebody at its other end.
+
+        Raises RunError naming the links that nobody answered.
+        """
+        matched, news = set(), SimpleQueue[str]()
+        for name, publisher in self._meeting.items():
+            self._kept.append(
+                publisher.declare_matching_listener(lambda s, name=name: news.put(name) if s.matching else None)
+            )
+            if publisher.matching_status.matching:
+                news.put(name)
+        end = time.monotonic() + timeout
+        while len(matched) < len(self._meeting):
+            try:
+                matched.add(news.get(timeout=max(0.0, end - time.monotonic())))
+            except Empty:
+                missing = ", ".join(name for name in self._meeting if name not in matched)
+                raise RunError(f"{self.who}: nobody answered on {missing} within {timeout:g} s of the start") from None
+
+    # -- receiving --------------------------------------------------------------------------------------------------
+
+    def get(self, timeout: float) -> tuple[Source, Frame] | None:
+        """The next good frame, or None when a peer has gone (its sources say ``gone``).
+
+        Bad frames are counted at their source, warned about once per cause, and dropped. Raises ``queue.Empty`` when
+        nothing came for ``timeout`` seconds.
+        """
+        while True:
+            source, data = self._queue.get(timeout=timeout)
+            if isinstance(source, str):
+                for s in self._sources:
+                    s.gone = s.gone or s.who == source
+                return None
+            try:
+                frame = decode(data, source.expected)  # type: ignore[arg-type]
+            except Rejected as e:
+                self.reject(source, e.cause)
+                continue
+            source.last = frame[:2]
+            return source, frame
+
+    def pending(self) -> bool:
+        """Whether ``get`` would return at once."""
+        return not self._queue.empty()
+
+    def reject(self, source: Source, cause: str) -> None:
+        """Count a refused frame; the first of its kind is worth a line in the log."""
+        source.rejected[cause] += 1
+        if source.rejected[cause] == 1:
+            self._warn(f"refused a frame on {source.name}: {cause}")
+
+    def rejections(self) -> dict[str, int]:
+        """How many frames were refused, by cause."""
+        return dict(sum((s.rejected for s in self._sources), Counter()))

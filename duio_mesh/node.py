@@ -1,0 +1,74 @@
+"""The life of one sensor process: `python -m duio_mesh.node --spec nodes/node-3.spec`, or started by the launcher.
+
+It holds its own matrices and its neighbours' names, nothing else. Per step k: take y_i(k), u_i(k) from the plant; then,
+round by round, send one vector to the neighbours and take exactly the same round's vector from each of them; then keep
+the estimate of x(k).
+"""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+
+from duio_mesh.errors import RunError
+from duio_mesh.journal import Journal
+from duio_mesh.mesh import Mesh
+from duio_mesh.mesh.lockstep import Lockstep
+from duio_mesh.observers import make_observer
+from duio_mesh.process import Report, main
+from duio_mesh.spec import NodeSpec
+
+NO_VECTOR = np.zeros(0)
+EDGE_AHEAD = 2  # a neighbour can be one round ahead of us, and we one behind what we last used
+
+
+def run(spec: NodeSpec, report: Report) -> None:
+    """Run one node for ``spec.steps`` steps. Raises RunError when a neighbour or the plant is lost or late."""
+    i, p = spec.id, spec.p
+    observer = make_observer(spec)
+    with Mesh(spec.wire, f"node-{i}", report.warn) as mesh:
+        keys = mesh.keys
+        plant = mesh.hear(keys.plant(i), f"plant -> {i}", "plant", ready=("plant", i))
+        heard = {
+            j: mesh.hear(keys.edge(j, i), f"edge {j} -> {i}", f"node-{j}", ready=(j, i)) for j in sorted(spec.hears)
+        }
+        told = mesh.speak([(keys.edge(i, j), f"edge {i} -> {j}", (i, j)) for j in spec.tells])
+        credit = mesh.speak([(keys.credit(i), f"{i} -> plant", (i, "plant"))])
+        trace = mesh.speak([(keys.trace(i), f"{i} -> recorder", None)], drop=True)
+        mesh.watch()
+        mesh.meet()
+        report("ready")
+        samples = Lockstep(mesh, spec.deadline, spec.window)
+        edges = Lockstep(mesh, spec.deadline, EDGE_AHEAD)
+        row = sum(part.size for part in observer.estimate())
+        rounds, begin = 0, time.monotonic()
+        with Journal(spec.output, row, trace) as journal:
+            for k in range(spec.steps):
+                sample = samples.take(plant, k, 0, p + spec.m)
+                observer.sample(sample[:p], sample[p:])
+                for r in range(observer.rounds):
+                    out = observer.message(r)
+                    told.send(k, r, out)
+                    observer.exchange(r, {j: edges.take(source, k, r, out.size) for j, source in heard.items()})
+                    rounds += 1
+                estimate = observer.estimate()
+                if not np.isfinite(estimate.state).all():
+                    raise RunError(
+                        f"node-{i}: the estimate overflowed at step {k}; is the plant unstable and open loop?"
+                    )
+                journal.add(estimate)
+                if (k + 1) % spec.credit == 0 or k + 1 == spec.steps:
+                    credit.send(k + 1, 0, NO_VECTOR)
+        report(
+            "done",
+            steps=spec.steps,
+            rounds=rounds,
+            seconds=time.monotonic() - begin,
+            frames=told.frames,
+            rejected=mesh.rejections(),
+        )
+
+
+if __name__ == "__main__":
+    main(NodeSpec, run)

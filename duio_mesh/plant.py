@@ -1,0 +1,87 @@
+"""The life of the plant process: the true state, its sensors' noise, and flow control.
+
+It is always ahead of the nodes by at most a window of steps: each node says how far it is, and the slowest one counts.
+The truth goes to the plant's own file and to the recorder, never to a node.
+"""
+
+from __future__ import annotations
+
+import time
+from queue import Empty
+
+from duio_mesh.dynamics import Plant
+from duio_mesh.errors import RunError
+from duio_mesh.journal import Journal
+from duio_mesh.mesh import Mesh, Source
+from duio_mesh.process import Report, main
+from duio_mesh.spec import PlantSpec
+
+
+class Credits:
+    """How many steps each node has finished."""
+
+    def __init__(self, mesh: Mesh, sources: list[Source], spec: PlantSpec) -> None:
+        self._mesh, self._spec = mesh, spec
+        self._done = dict.fromkeys(sources, 0)
+
+    def slowest(self) -> int:
+        """Steps that every node has finished."""
+        return min(self._done.values())
+
+    def collect(self) -> None:
+        """Take what has arrived, without waiting."""
+        while self._mesh.pending():
+            self._take()
+
+    def wait(self, steps: int) -> None:
+        """Wait until every node has finished ``steps`` steps.
+
+        Raises RunError naming the nodes that do not move before the deadline, or that are lost.
+        """
+        while self.slowest() < steps:
+            late = [s for s, done in self._done.items() if done < steps]
+            lost = [s.who for s in late if s.gone]
+            if lost and not self._mesh.pending():
+                raise RunError(f"the plant lost {', '.join(lost)} before step {steps}")
+            try:
+                self._take()
+            except Empty:
+                who = ", ".join(f"{s.who} (at step {self._done[s]})" for s in late)
+                raise RunError(
+                    f"the plant waited {self._spec.deadline:g} s for {who} to finish step {steps - 1}"
+                ) from None
+
+    def _take(self) -> None:
+        if got := self._mesh.get(self._spec.deadline):
+            source, frame = got
+            self._done[source] = max(self._done[source], min(frame.k, self._spec.steps))
+
+
+def run(spec: PlantSpec, report: Report) -> None:
+    """Run the plant for ``spec.steps`` steps. Raises RunError when a node is lost or does not keep up."""
+    plant = Plant(spec)
+    with Mesh(spec.wire, "plant", report.warn) as mesh:
+        keys, ids = mesh.keys, [s.id for s in spec.sensors]
+        nodes = [mesh.hear(keys.credit(i), f"{i} -> plant", f"node-{i}", ready=(i, "plant")) for i in ids]
+        samples = {i: mesh.speak([(keys.plant(i), f"plant -> {i}", ("plant", i))]) for i in ids}
+        truth = mesh.speak([(keys.truth(), "plant -> recorder", None)], drop=True)
+        mesh.watch()
+        mesh.meet()
+        report("ready")
+        credits, begin = Credits(mesh, nodes, spec), time.monotonic()
+        with Journal(spec.output, plant.x.size, truth) as journal:
+            for k in range(spec.steps):
+                credits.collect()
+                credits.wait(k + 1 - spec.window)
+                for i, data in plant.sample().items():
+                    samples[i].send(k, 0, data)
+                journal.add((plant.x,))
+                plant.advance()
+            journal.flush()
+            credits.wait(spec.steps)
+        frames = sum(outlet.frames for outlet in samples.values())
+        report("done", steps=spec.steps, seconds=time.monotonic() - begin, frames=frames, rejected=mesh.rejections())
+
+
+if __name__ == "__main__":
+    main(PlantSpec, run)

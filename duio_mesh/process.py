@@ -1,0 +1,82 @@
+"""What plant, node and recorder processes have in common: how they start, say how they are, and end.
+
+A process reports events as JSON lines, to the launcher's pipe when it was started by the launcher, else to its standard
+output. Ends: 0 done, 3 failed (the reason is the last event), 143 asked to stop by SIGTERM.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import signal
+import sys
+import time
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+from types import FrameType
+from typing import Any, NoReturn
+
+from duio_mesh.errors import DuioError
+from duio_mesh.spec import Spec, read_spec
+
+FAILED, STOPPED = 3, 143
+
+
+class Stop(BaseException):
+    """Raised in the main thread by SIGTERM, so that every ``with`` is left properly."""
+
+
+class Report:
+    """Says what happens in a process, one JSON line an event."""
+
+    def __init__(self, who: str, fd: int, log: Path | None = None) -> None:
+        self._who, self._fd = who, fd
+        self._log = log.open("a") if log else None  # noqa: SIM115  (one line at a time, closed by the process' end)
+
+    def __call__(self, event: str, **fields: Any) -> None:
+        """Report ``event``; a launcher that is gone is not an error here (the process is about to be ended)."""
+        line = json.dumps({"who": self._who, "event": event, **fields}) + "\n"
+        if self._log:
+            self._log.write(json.dumps({"time": round(time.time(), 6)})[:-1] + ", " + line[1:])
+            self._log.flush()
+        try:
+            os.write(self._fd, line.encode()[:4096])  # at most PIPE_BUF: lines of several processes do not mix
+        except BrokenPipeError:
+            return
+
+    def warn(self, text: str) -> None:
+        """Report something odd that does not end the process."""
+        self("warning", text=text)
+
+
+def live(kind: type[Spec], run: Callable[[Spec, Report], None], path: Path, report: Report) -> int:
+    """Read the spec, run, report; the exit code. Nothing is raised but SystemExit's relatives."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the launcher's to handle: it asks everybody to stop
+
+    def stop(signum: int, frame: FrameType | None) -> None:
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        raise Stop
+
+    signal.signal(signal.SIGTERM, stop)
+    try:
+        run(read_spec(path, kind), report)
+    except Stop:
+        report("stopped")
+        return STOPPED
+    except (DuioError, ValueError, OSError) as e:
+        report("failed", text=str(e))
+        return FAILED
+    except Exception as e:
+        report("failed", text=f"{type(e).__name__}: {e}", traceback=traceback.format_exc()[-2000:])
+        return FAILED
+    return 0
+
+
+def main(kind: type[Spec], run: Callable[[Spec, Report], None]) -> NoReturn:
+    """The command line of one process, for containers and hosts without the launcher."""
+    parser = argparse.ArgumentParser(description=f"Run one process of a duio_mesh run from its {kind.__name__}.")
+    parser.add_argument("--spec", type=Path, required=True, help="spec file that the launcher or an export wrote")
+    args = parser.parse_args()
+    sys.exit(live(kind, run, args.spec, Report(args.spec.stem, 1)))
