@@ -1,0 +1,82 @@
+"""E_i and P_i: taking the inputs that a node does not know out of its error (seed 000, section 4.1; seed 001, H = -E)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from duio_mesh.arrays import Array
+from duio_mesh.errors import DesignError
+from duio_mesh.geometry.subspace import RTOL, image, rank, unit_columns, unit_rows
+from duio_mesh.scenario.model import Scenario
+
+
+class Decoupling(NamedTuple):
+    """What takes the unknown inputs out of one node's error, and how far its ranks are from failing."""
+
+    E: Array  # (n, p) of x-hat = xi - E y; E = -B̄ (C B̄)^+
+    P: Array  # (n, n) = I + E C, a projection with P B̄ = 0
+    basis: Array  # (n, r) orthonormal columns that span im B̄
+    margins: dict[str, float]
+    """Least singular values behind the rank tests, free of units: 0 fails, 1 is as good as it gets or nothing is asked.
+
+    - ``output_rank``: of C with rows of length 1 (Assumption 1);
+    - ``unknown_input_rank``: of B̄ with columns of length 1, among those kept, relative to the largest (Assumption 1);
+    - ``decoupling_rank``: of C, rows of length 1, times ``basis`` (Assumption 2);
+    - ``complement_rank``: of [P; basis'] (condition (10)).
+    """
+
+
+def decouple(C: Array, Bbar: Array, node: str = "a node", unknown: Sequence[str] = ()) -> Decoupling:
+    """E and P for y = C x (p, n) and the matrix Bbar (n, .) of the inputs that the node is not told.
+
+    Only im Bbar matters: E = -B̄ (C B̄)^+ is the same for every basis B̄ of it, so zero and dependent columns are left
+    out (seed 000, Remark 1). Without an unknown input E = 0 and P = I (Remark 2). The rank of C is measured, not demanded.
+    Raises DesignError when Assumption 2, rank(C B̄) = rank(B̄), fails; ``node`` and ``unknown`` (names) are for its text.
+    Source: seed 000, (6)-(10) with H_i = 0.
+    """
+    p, n = C.shape
+    columns = unit_columns(Bbar)
+    basis = image(columns)
+    r = basis.shape[1]
+    rows = unit_rows(C)
+    seen = np.linalg.svd(rows @ basis, compute_uv=False)
+    if np.sum(seen > RTOL) < r:
+        raise DesignError(_cannot_decouple(seen, p, r, node, unknown))
+    E = -basis @ np.linalg.pinv(C @ basis) if r else np.zeros((n, p))
+    P = np.eye(n) + E @ C
+    margins = {
+        "output_rank": _least(rows.T, p),
+        "unknown_input_rank": min(1.0, rank(columns).kept),
+        "decoupling_rank": _least(rows @ basis, r),
+        "complement_rank": _least(np.vstack([P, basis.T]), n),
+    }
+    return Decoupling(E, P, basis, margins)
+
+
+def decouple_node(scenario: Scenario, i: int) -> Decoupling:
+    """``decouple`` for node i of the scenario. Raises DesignError that names the node and its unknown inputs."""
+    told = set(scenario.nodes[i].knows)
+    names = [name for name in scenario.plant.inputs if name not in told]
+    names += [f"disturbance {j}" for j in range(1, scenario.plant.E.shape[1] + 1)]
+    return decouple(scenario.nodes[i].C, scenario.unknown(i), f"node {i}", names)
+
+
+def _least(M: Array, wanted: int) -> float:
+    """The singular value of M that must not vanish when M shall have rank ``wanted``, at most 1."""
+    if wanted == 0:
+        return 1.0
+    return min(1.0, float(np.linalg.svd(M, compute_uv=False)[wanted - 1])) if min(M.shape) >= wanted else 0.0
+
+
+def _cannot_decouple(seen: Array, p: int, r: int, node: str, unknown: Sequence[str]) -> str:
+    names = f" ({', '.join(unknown)})" if unknown else ""
+    values = ", ".join(f"{value:.3g}" for value in seen)
+    return (
+        f"{node}: Assumption 2 fails: rank(C_i B_iw) = {np.sum(seen > RTOL)}, but {r} independent unknown inputs{names} "
+        f"act on the plant. Singular values of C_i B_iw, free of units: [{values}]. "
+        f"{f'It has only {p} measurements. ' if p < r else ''}"
+        "Let it know one of these inputs, or let it measure a state that they reach within one step."
+    )
