@@ -26,6 +26,9 @@ SIGNALS: dict[str, Callable[[Mapping[str, float], float, np.random.Generator], f
 }
 """Kinds of signal terms with all their parameters (the scenario fills in the defaults); t in seconds, phase in rad."""
 
+SINUSOIDS = frozenset({"sine", "cosine"})
+"""The kinds that a continuous plant integrates as oscillators."""
+
 
 def signal(terms: Iterable[Mapping[str, Mapping[str, float]]], t: float, rng: np.random.Generator) -> float:
     """The sum of the terms at time t."""
@@ -38,34 +41,29 @@ def signals(many: Iterable[Any], t: float, rng: np.random.Generator) -> Array:
 
 
 class Plant:
-    """x(k+1) = A x + B u + E w, measured as y_i = C_i x + F_i v_i (seed 000, (1)-(2)).
+    """The plant and its sensors: dx/dt or x(k+1) = A x + B u + E w, measured as y_i = C_i x + F_i v_i.
 
-    ``sample`` must be called once per step, then ``advance``; noise is drawn as it is needed, in a fixed order.
+    (Seed 000, (1)-(2); seed 004, (1).) ``sample`` must be called once per step, then ``advance``; noise is drawn as it
+    is needed, in a fixed order. A continuous plant is propagated exactly from sample to sample, its feedback acting
+    continuously; ``normal`` signals are drawn once per step and held.
     """
 
     def __init__(self, spec: PlantSpec) -> None:
-        def stream(*purpose: int) -> np.random.Generator:
-            return np.random.default_rng([spec.seed, *purpose])
-
         self.spec = spec
         self.k = 0
-        self._A, self._B, self._E = (spec.matrices[name] for name in "ABE")
-        self._control, self._disturbance = stream(_CONTROL), stream(_DISTURBANCE)
-        self._noise = {s.id: stream(_NOISE, s.id) for s in spec.sensors}
+        self._noise = {s.id: _stream(spec, _NOISE, s.id) for s in spec.sensors}
+        self._motion = _Recursion(spec) if spec.time == "discrete" else _Flow(spec)
         if "value" in spec.x0:
             self.x = spec.x0["value"].copy()
         else:
             mean, std = spec.x0["mean"], spec.x0["std"]
-            self.x = mean + std * stream(_STATE).standard_normal(mean.shape)
-        self.u = np.zeros(self._B.shape[1])
+            self.x = mean + std * _stream(spec, _STATE).standard_normal(mean.shape)
+        self.u = np.zeros(spec.matrices["B"].shape[1])
 
     def sample(self) -> dict[int, Array]:
         """[y_i(k); u_i(k)] for every node: what the plant process sends."""
         t, spec = self.k * self.spec.step, self.spec
-        if spec.feedback:
-            self.u = spec.feedback["F"] @ (self.x - spec.feedback["reference"])
-        else:
-            self.u = signals(spec.control, t, self._control)
+        self.u = self._motion.input(self.k, self.x)
         data = {}
         for s in spec.sensors:
             y = s.C @ self.x + s.channel @ signals(s.noise, t, self._noise[s.id])
@@ -73,7 +71,73 @@ class Plant:
         return data
 
     def advance(self) -> None:
-        """From x(k) to x(k+1) under the u(k) that ``sample`` announced."""
-        w = signals(self.spec.disturbance, self.k * self.spec.step, self._disturbance)
-        self.x = self._A @ self.x + self._B @ self.u + self._E @ w
+        """From x(k) to x(k+1), under the input whose value at k ``sample`` announced."""
+        self.x = self._motion.next(self.k, self.x, self.u)
         self.k += 1
+
+
+def _stream(spec: PlantSpec, *purpose: int) -> np.random.Generator:
+    return np.random.default_rng([spec.seed, *purpose])
+
+
+class _Recursion:
+    """x(k+1) = A x(k) + B u(k) + E w(k)."""
+
+    def __init__(self, spec: PlantSpec) -> None:
+        self._spec = spec
+        self._A, self._B, self._E = (spec.matrices[name] for name in "ABE")
+        self._control, self._disturbance = _stream(spec, _CONTROL), _stream(spec, _DISTURBANCE)
+
+    def input(self, k: int, x: Array) -> Array:
+        """u(k) (m,)."""
+        spec = self._spec
+        if spec.feedback:
+            return np.asarray(spec.feedback["F"] @ (x - spec.feedback["reference"]))
+        return signals(spec.control, k * spec.step, self._control)
+
+    def next(self, k: int, x: Array, u: Array) -> Array:
+        """x(k+1) (n,)."""
+        w = signals(self._spec.disturbance, k * self._spec.step, self._disturbance)
+        return np.asarray(self._A @ x + self._B @ u + self._E @ w)
+
+
+class _Flow:
+    """x(k+1) = Phi x + Psi s(k) + Gamma held(k) + switched(k), exact for dx/dt = A x + [B, E] d(t).
+
+    ``duio_mesh.synthesis.propagation`` computes the matrices and says what they are. The oscillators s come from their
+    closed form at every tick, so no rounding accumulates in them.
+    """
+
+    def __init__(self, spec: PlantSpec) -> None:
+        M = spec.matrices
+        self._spec = spec
+        self._Phi, self._Psi, self._Gamma, self._H = M["Phi"], M["Psi"], M["Gamma"], M["H"]
+        self._omega = 2 * np.pi / M["periods"]
+        self._switched = dict(zip(M["switch_ticks"].astype(int).tolist(), M["switch_effects"], strict=True))
+        self._held_control, self._held_disturbance = _held(spec.control), _held(spec.disturbance)
+        self._control, self._disturbance = _stream(spec, _CONTROL), _stream(spec, _DISTURBANCE)
+        self._held_u = -spec.feedback["F"] @ spec.feedback["reference"] if spec.feedback else np.zeros(0)
+
+    def input(self, k: int, x: Array) -> Array:
+        """u at the beginning of tick k (m,)."""
+        spec = self._spec
+        if spec.feedback:
+            return np.asarray(spec.feedback["F"] @ (x - spec.feedback["reference"]))
+        self._held_u = signals(self._held_control, k * spec.step, self._control)
+        return np.asarray(self._held_u + self._H[: self._held_u.size] @ self._oscillators(k))
+
+    def next(self, k: int, x: Array, u: Array) -> Array:
+        """x at the end of tick k (n,); u itself is not needed, its parts are."""
+        w = signals(self._held_disturbance, k * self._spec.step, self._disturbance)
+        held = np.concatenate([self._held_u, w])
+        moved: Array = self._Phi @ x + self._Psi @ self._oscillators(k) + self._Gamma @ held
+        return moved + self._switched[k] if k in self._switched else moved
+
+    def _oscillators(self, k: int) -> Array:
+        phase = self._omega * (k * self._spec.step)
+        return np.concatenate([np.sin(phase), np.cos(phase)])
+
+
+def _held(many: Iterable[Iterable[Mapping[str, Any]]]) -> list[Any]:
+    """The signals without their sinusoids: what is constant over a tick, up to switches inside it."""
+    return [[term for term in terms if not SINUSOIDS & term.keys()] for terms in many]

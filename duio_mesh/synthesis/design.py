@@ -13,6 +13,7 @@ from duio_mesh.arrays import Array, contiguous
 from duio_mesh.errors import DesignError
 from duio_mesh.scenario.model import Lqr, Normal, OpenLoop, Plant, Scenario
 from duio_mesh.spec import NodeSpec, PlantSpec, SensorSpec
+from duio_mesh.synthesis.propagation import propagators
 
 Progress = Callable[[str], None]
 
@@ -50,7 +51,10 @@ def node_spec(
 
 
 def plant_spec(scenario: Scenario) -> PlantSpec:
-    """The plant process' spec; the LQR gain is computed here. Raises DesignError when no LQR gain exists."""
+    """The plant process' spec; LQR gain and continuous propagators are computed here.
+
+    Raises DesignError when no LQR gain exists, or when signals switch too often to be propagated exactly.
+    """
     plant, run = scenario.plant, scenario.run
     sensors = []
     for i, node in scenario.nodes.items():
@@ -61,6 +65,7 @@ def plant_spec(scenario: Scenario) -> PlantSpec:
     if not isinstance(control, OpenLoop):
         F = lqr_gain(plant, control) if isinstance(control, Lqr) else control.F
         feedback = {"F": contiguous(F), "reference": contiguous(control.reference)}
+    propagated = _propagated(plant, feedback, run.steps) if plant.time == "continuous" else {}
     x0 = plant.x0
     if isinstance(x0, Normal):
         initial = {"mean": contiguous(x0.mean), "std": contiguous(x0.std)}
@@ -69,7 +74,7 @@ def plant_spec(scenario: Scenario) -> PlantSpec:
     return PlantSpec(
         time=plant.time,
         step=plant.step,
-        matrices={"A": contiguous(plant.A), "B": contiguous(plant.B), "E": contiguous(plant.E)},
+        matrices={"A": contiguous(plant.A), "B": contiguous(plant.B), "E": contiguous(plant.E)} | propagated,
         x0=initial,
         feedback=feedback,
         control=control.signals if isinstance(control, OpenLoop) else (),
@@ -80,6 +85,15 @@ def plant_spec(scenario: Scenario) -> PlantSpec:
         window=run.window,
         deadline=run.deadline,
     )
+
+
+def _propagated(plant: Plant, feedback: Mapping[str, Array], steps: int) -> dict[str, Array]:
+    """The exact propagators of a continuous plant; feedback acts continuously, inside the propagated dynamics."""
+    A, control = plant.A, plant.control
+    drives = control.signals if isinstance(control, OpenLoop) else ((),) * plant.B.shape[1]
+    if feedback:
+        A = A + plant.B @ feedback["F"]
+    return propagators(A, np.hstack([plant.B, plant.E]), (*drives, *plant.disturbance), plant.step, steps)
 
 
 def lqr_gain(plant: Plant, weights: Lqr) -> Array:
