@@ -4,6 +4,14 @@ Start with ``observability_decomposition`` and ``detectability_decomposition`` (
 ``unknown_input_structure`` (invariant) and ``reduced_observer`` (injection).
 """
 
+from duio_mesh.geometry.injection import MAX_GAIN, ReducedObserver, place, reduced_observer, stabilise
+from duio_mesh.geometry.invariant import (
+    InputStructure,
+    friend,
+    infimal_invariant,
+    infimal_unobservability,
+    unknown_input_structure,
+)
 from duio_mesh.geometry.stability import Stability, split_spectrum, stable_abscissa, stable_radius
 from duio_mesh.geometry.staircase import (
     Decomposition,
@@ -30,27 +38,37 @@ from duio_mesh.geometry.subspace import (
 )
 
 __all__ = [
+    "MAX_GAIN",
     "RTOL",
     "Decomposition",
     "GeometryError",
+    "InputStructure",
     "Rank",
+    "ReducedObserver",
     "Stability",
     "add",
     "complement",
     "contains",
     "detectability_decomposition",
     "excess",
+    "friend",
     "gap",
     "image",
+    "infimal_invariant",
+    "infimal_unobservability",
     "intersection",
     "kernel",
     "observability_decomposition",
     "orth",
+    "place",
     "preimage",
     "quotient",
     "rank",
+    "reduced_observer",
     "split_spectrum",
+    "stabilise",
     "stable_abscissa",
     "stable_radius",
+    "unknown_input_structure",
     "unobservable_subspace",
 ]

@@ -16,7 +16,7 @@ from duio_mesh.geometry.stability import Stability, split_spectrum
 from duio_mesh.geometry.subspace import (
     RTOL,
     Rank,
-    as_matrix,
+    as_pair,
     complement,
     kernel_with_margin,
     norm,
@@ -57,25 +57,19 @@ def _unobservable(C: Array, A: Array, rtol: float) -> tuple[Array, Rank]:
     return V, margin._replace(rank=V.shape[1])
 
 
-def _pair(C: Array, A: Array) -> tuple[Array, Array]:
-    A = as_matrix("A", A)
-    A = as_matrix("A", A, A.shape[0], A.shape[0])
-    return as_matrix("C", C, columns=A.shape[0]), A
-
-
 def unobservable_subspace(C: Array, A: Array, rtol: float = RTOL) -> Array:
     """<Ker C | A>: the largest A-invariant subspace inside Ker C. C is (p, n), A is (n, n).
 
     ``rtol`` is relative to 1 for C (rows scaled to length 1) and to ||A||_2 for A.
     Raises GeometryError for wrong shapes or values that are not finite.
     """
-    C, A = _pair(C, A)
+    C, A = as_pair(C, A)
     return _unobservable(C, A, rtol)[0]
 
 
 def observability_decomposition(C: Array, A: Array, rtol: float = RTOL) -> Decomposition:
     """D and U with U the unobservable subspace of (C, A). Arguments and errors as ``unobservable_subspace``."""
-    C, A = _pair(C, A)
+    C, A = as_pair(C, A)
     U, decided = _unobservable(C, A, rtol)
     return Decomposition(complement(U), U, np.linalg.eigvals(U.T @ A @ U).astype(np.complex128), decided)
 
@@ -86,7 +80,7 @@ def detectability_decomposition(C: Array, A: Array, stability: Stability, rtol: 
     The bad modes are split off by the ordered real Schur form of A restricted to the unobservable subspace.
     Arguments and errors as ``unobservable_subspace``; also GeometryError when good and bad modes cannot be separated.
     """
-    C, A = _pair(C, A)
+    C, A = as_pair(C, A)
     V, decided = _unobservable(C, A, rtol)
     Z, bad, _ = split_spectrum(V.T @ A @ V, stability)
     U = V @ Z

@@ -52,6 +52,13 @@ def as_matrix(name: str, M: Any, rows: int | None = None, columns: int | None = 
     return a
 
 
+def as_pair(C: Any, A: Any) -> tuple[Array, Array]:
+    """C (p, n) and A (n, n) as matrices that fit together. Raises GeometryError."""
+    A = as_matrix("A", A)
+    A = as_matrix("A", A, A.shape[0], A.shape[0])
+    return as_matrix("C", C, columns=A.shape[0]), A
+
+
 def norm(M: Array) -> float:
     """The largest singular value; 0 for an empty matrix."""
     return float(linalg.norm(M, 2)) if M.size else 0.0
@@ -114,10 +121,16 @@ def residual(V: Array, M: Array) -> Array:
 
 def add(V: Array, W: Array, rtol: float = RTOL, scale: float = 1.0) -> Array:
     """V + Im W, with V's basis as the first columns. W need not be a basis: ``scale`` is its size (1 for a basis)."""
-    R = image(residual(V, W), rtol, scale)
-    if R.shape[1]:
+    return add_with_margin(V, W, rtol, scale)[0]
+
+
+def add_with_margin(V: Array, W: Array, rtol: float = RTOL, scale: float = 1.0) -> tuple[Array, Rank]:
+    """V + Im W and the rank decision about the directions that W adds."""
+    U, _, decided = _svd(residual(V, W), rtol, scale)
+    R = U[:, : decided.rank]
+    if decided.rank:
         R = linalg.qr(residual(V, R), mode="economic")[0]
-    return np.hstack([V, R])
+    return np.hstack([V, R]), decided
 
 
 def intersection(V: Array, W: Array, rtol: float = RTOL) -> Array:
