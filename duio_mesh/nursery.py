@@ -60,7 +60,8 @@ class Nursery:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         text = b""
         while True:
-            ready, _, _ = select.select([self._control, wake_read], [], [])
+            waiting: list[Any] = [self._control, wake_read]
+            ready, _, _ = select.select(waiting, [], [])
             if wake_read in ready:
                 with contextlib.suppress(BlockingIOError):
                     os.read(wake_read, 4096)

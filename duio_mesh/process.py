@@ -33,7 +33,7 @@ class Report:
 
     def __init__(self, who: str, fd: int, log: Path | None = None) -> None:
         self._who, self._fd = who, fd
-        self._log = log.open("a") if log else None  # noqa: SIM115  (one line at a time, closed by the process' end)
+        self._log = log.open("a") if log else None
 
     def __call__(self, event: str, **fields: Any) -> None:
         """Report ``event``; a launcher that is gone is not an error here (the process is about to be ended)."""

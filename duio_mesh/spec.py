@@ -18,6 +18,8 @@ import numpy as np
 
 from duio_mesh.arrays import Array, contiguous
 
+START = 30.0  # seconds for all processes of a run to find each other
+
 Signals: TypeAlias = tuple[Any, ...]  # plain data: see duio_mesh.dynamics.signal
 
 

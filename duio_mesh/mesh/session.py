@@ -29,10 +29,9 @@ from duio_mesh.arrays import Array
 from duio_mesh.errors import RunError
 from duio_mesh.mesh.frames import Encoder, Frame, Rejected, decode, prefix
 from duio_mesh.mesh.keys import Keys
-from duio_mesh.spec import Wire
+from duio_mesh.spec import START, Wire
 
 Ready: TypeAlias = tuple[int | str, int | str]  # (source, target) of a link, for the start barrier
-START = 30.0  # seconds for all processes of a run to find each other
 
 
 def _config(wire: Wire) -> zenoh.Config:
@@ -139,7 +138,7 @@ class Mesh:
         return source
 
     def speak(self, links: Iterable[tuple[str, str, Ready | None]], drop: bool = False) -> Outlet:
-        """Publish on every (key, name, ready) of ``links``; with ``drop`` a slow receiver costs frames, not our time."""
+        """Publish on every (key, name, ready) of ``links``; with ``drop`` a slow receiver costs frames, not time."""
         publishers = []
         for key, name, ready in links:
             control = zenoh.CongestionControl.DROP if drop else zenoh.CongestionControl.BLOCK
@@ -216,6 +215,10 @@ class Mesh:
                 continue
             source.last = frame[:2]
             return source, frame
+
+    def wake(self) -> None:
+        """Make a waiting ``get`` return None; safe in a signal handler."""
+        self._queue.put(("", None))
 
     def pending(self) -> bool:
         """Whether ``get`` would return at once."""

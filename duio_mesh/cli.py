@@ -1,0 +1,156 @@
+"""The command line: `python launch.py TOPOLOGY`. Reads, designs, runs, and says what came of it.
+
+Exit codes: 0 converged, 1 ran but did not converge, 2 the file or the design is impossible (nothing was started),
+3 a run failed, 130 interrupted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import signal
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, NoReturn
+
+from duio_mesh import __version__
+from duio_mesh.errors import DesignError, RunError, ScenarioError
+
+if TYPE_CHECKING:
+    from duio_mesh.launcher import RunResult
+    from duio_mesh.supervisor import Supervisor
+    from duio_mesh.synthesis.design import Design
+
+CONVERGED, NOT_CONVERGED, IMPOSSIBLE, FAILED, INTERRUPTED = 0, 1, 2, 3, 130
+
+EPILOG = """\
+exit codes: 0 converged as the file asks, 1 ran but did not converge, 2 the file or the design is impossible (nothing
+was started), 3 a run failed (the message names the process or the edge), 130 interrupted.
+
+examples:
+  python launch.py topologies/partitioned.yaml
+  python launch.py topologies/ring.yaml --steps 2000 --seed 7 --plot
+  python launch.py topologies/ring.yaml --set plant.noise.variance=0 --set graph.edges='[[1,2],[3,4]]'
+  python launch.py topologies/six_state_ring.yaml --check
+"""
+
+
+def parser() -> argparse.ArgumentParser:
+    """The options of the command line (docs/design.md, section 4)."""
+    p = argparse.ArgumentParser(
+        prog="launch.py",
+        description="Run a distributed unknown-input observer as real processes that talk over Zenoh along a graph.",
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    p.add_argument("topology", type=Path, help="topology file (docs/topology-file.md)")
+    p.add_argument("--steps", type=int, metavar="K", help="samples to run, instead of run.steps")
+    p.add_argument("--seed", type=int, metavar="S", help="seed of initial state and noise, instead of run.seed")
+    p.add_argument("--out", type=Path, metavar="DIR", help="folder for the results (default runs/<name>/<UTC time>)")
+    how = p.add_mutually_exclusive_group()
+    how.add_argument(
+        "--in-process", action="store_true", help="one process, no Zenoh: the oracle; same results, bit for bit"
+    )
+    how.add_argument(
+        "--check", action="store_true", help="validate, test the existence conditions, design, start nothing"
+    )
+    how.add_argument("--dry-run", action="store_true", help="print what would be started")
+    p.add_argument("--live", action="store_true", help="also serve the recording to a Rerun viewer on this host")
+    p.add_argument("--plot", action="store_true", help="write PNG figures of the errors and states into the results")
+    p.add_argument("--no-record", action="store_true", help="no recorder process, no recording.rrd")
+    p.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="PATH=VALUE",
+        dest="overrides",
+        help="override a value of the resolved file, e.g. plant.noise.variance=0 (YAML; may be repeated)",
+    )
+    p.add_argument("--version", action="version", version=f"duio_mesh {__version__}")
+    return p
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line; the exit code."""
+    args = parser().parse_args(argv)
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, _interrupt)
+    try:
+        return _main(args)
+    except (ScenarioError, DesignError) as e:
+        print(e, file=sys.stderr)
+        return IMPOSSIBLE
+    except RunError as e:
+        print(f"run failed: {e}", file=sys.stderr)
+        return FAILED
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        return INTERRUPTED
+
+
+def _interrupt(*_: object) -> NoReturn:
+    raise KeyboardInterrupt
+
+
+def _main(args: argparse.Namespace) -> int:
+    from duio_mesh import synthesis
+    from duio_mesh.scenario import load_scenario
+
+    flags = {"run.steps": args.steps, "run.seed": args.seed}
+    overrides = args.overrides + [f"{path}={value}" for path, value in flags.items() if value is not None]
+    scenario = load_scenario(args.topology, overrides, options_of=synthesis.options_of)
+    if args.out and args.out.exists() and (not args.out.is_dir() or any(args.out.iterdir())):
+        raise ScenarioError(
+            [f"--out {args.out}: already exists and is not an empty folder; a run is never overwritten"]
+        )
+
+    from duio_mesh import console
+
+    processes = not (args.in_process or args.check or args.dry_run)
+    with _nursery() if processes else contextlib.nullcontext() as supervisor:
+        with console.working("designing the observers") as say:
+            design = synthesis.synthesise(scenario, say)
+        if args.check:
+            console.certificate(design)
+            return CONVERGED
+        if args.dry_run:
+            console.plan(design, record=not args.no_record)
+            return CONVERGED
+        result = _run(design, args, supervisor)
+    console.result(design, result, live=args.live)
+    return CONVERGED if result.converged else NOT_CONVERGED
+
+
+@contextlib.contextmanager
+def _nursery() -> Iterator[Supervisor]:
+    """A nursery that gets ready while the gains are designed."""
+    from duio_mesh.supervisor import Supervisor
+
+    with Supervisor() as supervisor:
+        yield supervisor
+
+
+def _run(design: Design, args: argparse.Namespace, supervisor: Supervisor | None) -> RunResult:
+    """Run the design as asked, with progress, and draw the figures."""
+    from duio_mesh import console, launcher
+
+    with console.progress(design) as show:
+        if supervisor is None:
+            result = launcher.run_in_process(design, args.out, record=not args.no_record, show=show)
+        else:
+            result = launcher.run(
+                design,
+                args.out,
+                record=not args.no_record,
+                live=args.live,
+                show=show,
+                hold=console.hold if args.live else None,
+                supervisor=supervisor,
+            )
+    if args.plot:
+        from duio_mesh.report.figures import figures
+
+        with console.working("drawing the figures"):
+            figures(result.folder, design.scenario, result.trace)
+    return result

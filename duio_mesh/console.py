@@ -1,0 +1,142 @@
+"""What a person sees in the terminal: progress, the certificate, the result. Only the command line uses it."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from duio_mesh import launcher
+from duio_mesh.launcher import RunResult
+from duio_mesh.synthesis.design import Design
+
+FEW = 8  # nodes whose errors are shown one by one
+
+_out = Console(highlight=False)
+_err = Console(stderr=True, highlight=False)
+
+
+@contextlib.contextmanager
+def working(on: str) -> Iterator[Callable[[str], None]]:
+    """Show that something is being done, and what part of it."""
+    with _err.status(on) as status:
+        yield lambda part: status.update(f"{on}: {part}")
+
+
+@contextlib.contextmanager
+def progress(design: Design) -> Iterator[launcher.Show]:
+    """A bar with steps, steps per second, and every node's newest error."""
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(bar_width=24),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[rate]}"),
+        TimeRemainingColumn(),
+        TextColumn("{task.fields[errors]}"),
+    )
+    with Progress(*columns, console=_err) as bar:
+        task = bar.add_task("running", total=design.plant.steps, rate="", errors="starting the processes")
+
+        def show(now: launcher.Progress) -> None:
+            speed = bar.tasks[0].speed
+            rate = f"{speed:,.0f} steps/s" if speed else ""
+            bar.update(task, completed=now.steps, rate=rate, errors=errors_in_words(now.errors))
+
+        yield show
+
+
+def errors_in_words(errors: Mapping[int, float]) -> str:
+    """The newest error of every node, or of the best, the middle and the worst of many."""
+    if len(errors) <= FEW:
+        return "  ".join(f"|e{i}| {e:.1e}" for i, e in sorted(errors.items()))
+    ranked = sorted((e, i) for i, e in errors.items())
+    chosen = (("best", ranked[0]), ("median", ranked[len(ranked) // 2]), ("worst", ranked[-1]))
+    return "  ".join(f"{name} |e{i}| {e:.1e}" for name, (e, i) in chosen)
+
+
+def hold(url: str) -> None:
+    """Keep the live server until the person has seen enough; at once where nobody is."""
+    if sys.stdin.isatty():
+        _err.print(f"still serving the recording: rerun {url}\npress Enter to end")
+        sys.stdin.readline()
+
+
+def result(design: Design, result: RunResult, *, live: bool) -> None:
+    """The table of errors, the verdict, and where everything is."""
+    scenario, metrics = design.scenario, result.metrics
+    table = Table(title=f"{scenario.name}: {scenario.method}, {len(scenario.nodes)} nodes, {metrics['steps']} steps")
+    for column in ("node", "RMS error", "final error"):
+        table.add_column(column, justify="right")
+    for i, node in metrics["nodes"].items():
+        table.add_row(str(i), _number(node["rms"]), _number(node["final"]))
+    _out.print(table)
+    wanted = scenario.run.convergence
+    words = "[green]converged[/]" if result.converged else "[red]did not converge[/]"
+    _out.print(
+        f"{words}: every node's RMS error over the last {wanted.over_last:.0%} of the run "
+        f"{'is' if result.converged else 'should be'} below {wanted.rms_below:g}"
+    )
+    for warning in result.warnings:
+        _out.print(f"[yellow]warning:[/] {warning}")
+    _out.print(f"results    {result.folder}")
+    recording = result.folder / "recording.rrd"
+    if recording.exists():
+        _out.print(f"open with  rerun {recording}", soft_wrap=True)
+
+
+def certificate(design: Design) -> None:
+    """What the design promises."""
+    found = design.certificate
+    _out.print(f"[bold]{design.scenario.name}[/]: {design.scenario.method}, {len(design.nodes)} nodes")
+    conditions = Table("condition", "value", "needed", "", title="conditions")
+    for name, condition in found["conditions"].items():
+        mark = "[green]ok[/]" if condition["ok"] else "[red]no[/]"
+        conditions.add_row(name, _text(condition["value"]), _text(condition["threshold"]), mark)
+    _out.print(conditions)
+    nodes = found["nodes"]
+    columns = [key for key, value in next(iter(nodes.values())).items() if not isinstance(value, Mapping)]
+    table = Table("node", *columns, title="nodes")
+    for i, node in nodes.items():
+        table.add_row(str(i), *(_text(node.get(key)) for key in columns))
+    _out.print(table)
+    for name, value in found.items():
+        if name not in ("conditions", "nodes"):
+            _out.print(f"{name:24} {_text(value)}")
+
+
+def plan(design: Design, *, record: bool) -> None:
+    """What a run would start, and who would talk to whom."""
+    table = Table("process", "command", "hears", "tells", title="would be started")
+    table.add_row("duio-plant", "python -m duio_mesh.plant --spec nodes/plant.spec", "", _text(list(design.nodes)))
+    for i, spec in design.nodes.items():
+        command = f"python -m duio_mesh.node --spec nodes/node-{i}.spec"
+        table.add_row(f"duio-node-{i}", command, _text(list(spec.hears)), _text(list(spec.tells)))
+    if record:
+        table.add_row("duio-recorder", "python -m duio_mesh.recorder --spec nodes/recorder.spec", "everybody", "")
+    _out.print(table)
+    _out.print(
+        f"{design.plant.steps} steps; peers on loopback, links only along the edges, to the plant and the recorder"
+    )
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None or not math.isfinite(value) else f"{value:.4g}"
+
+
+def _text(value: Any) -> str:
+    """Plain data in one line."""
+    if isinstance(value, bool) or value is None:
+        return {True: "yes", False: "no", None: "-"}[value]
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    if isinstance(value, Mapping):
+        return ", ".join(f"{k}: {_text(v)}" for k, v in value.items())
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(_text(v) for v in value) + "]"
+    return str(value)

@@ -1,0 +1,259 @@
+"""Runs a design as processes: hands each its spec, watches them, and gathers what they leave.
+
+The launcher itself never opens a Zenoh session: it knows its children through the nursery, their reports and their
+journals, and so it cannot disturb the mesh.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import secrets
+import socket
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from duio_mesh.arrays import Array
+from duio_mesh.errors import RunError
+from duio_mesh.report.metrics import metrics
+from duio_mesh.report.trace_file import write_trace
+from duio_mesh.run_folder import RunFolder
+from duio_mesh.scenario.model import Scenario
+from duio_mesh.simulation import Trace, estimate_sizes, simulate
+from duio_mesh.spec import NodeSpec, PlantSpec, RecorderSpec, Wire, write_spec
+from duio_mesh.supervisor import Supervisor
+from duio_mesh.synthesis.design import Design
+
+LOOPBACK = "127.0.0.1"
+CLOSING = 60.0  # seconds for the recorder to fill gaps and close its file after a long run
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far a run is."""
+
+    steps: int  # finished by every node
+    errors: Mapping[int, float]  # node id -> 2-norm of its newest estimation error; empty before the first
+
+
+Show: TypeAlias = Callable[[Progress], None]
+
+
+def ignore(_: Progress) -> None:
+    """Show nothing."""
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """A finished run."""
+
+    folder: Path
+    trace: Trace
+    metrics: Mapping[str, Any]
+    converged: bool
+    warnings: tuple[str, ...]  # what went wrong without stopping the run
+
+
+class Launch:
+    """One run of a design over Zenoh on this host."""
+
+    def __init__(self, design: Design, folder: RunFolder, supervisor: Supervisor, *, record: bool, live: bool) -> None:
+        self._design, self._folder, self._supervisor = design, folder, supervisor
+        self._record, self._live = record, live
+        self._sizes = estimate_sizes(design)
+        self._held: list[socket.socket] = []
+
+    def specs(self) -> dict[str, NodeSpec | PlantSpec | RecorderSpec]:
+        """Every process' spec, with endpoints that are reserved for it."""
+        design, folder, run = self._design, self._folder, secrets.token_hex(4)
+        ids = sorted(design.nodes)
+        at = {i: self._reserve() for i in ids}
+        plant = self._reserve()
+        specs: dict[str, NodeSpec | PlantSpec | RecorderSpec] = {
+            "plant": replace(design.plant, wire=Wire(run, (plant,), ()), output=str(folder.rows("plant")))
+        }
+        for i, spec in design.nodes.items():
+            neighbours = sorted(set(spec.hears) | set(spec.tells))
+            dial = (plant, *(at[j] for j in neighbours if j < i))  # one link per edge: the later one dials
+            specs[f"node-{i}"] = replace(spec, wire=Wire(run, (at[i],), dial), output=str(folder.rows(f"node-{i}")))
+        if self._record:
+            specs["recorder"] = RecorderSpec(
+                name=design.scenario.name,
+                n=design.scenario.plant.n,
+                sizes=self._sizes,
+                arcs=tuple((a.source, a.target) for a in design.scenario.graph.arcs),
+                step=design.plant.step,
+                steps=design.plant.steps,
+                recording=str(folder.root / "recording.rrd"),
+                live=self._live,
+                description=design.scenario.description,
+                truth=str(folder.rows("plant")),
+                estimates={i: str(folder.rows(f"node-{i}")) for i in ids},
+                # it dials everybody, so that nobody has to wait for it or misses it
+                wire=Wire(run, (), (plant, *(at[i] for i in ids))),
+            )
+        return specs
+
+    def _reserve(self) -> str:
+        """A free port of the loopback, kept bound (not listening) until the process that gets it listens there."""
+        s = socket.socket()
+        s.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        s.bind((LOOPBACK, 0))
+        self._held.append(s)
+        return f"tcp/{LOOPBACK}:{s.getsockname()[1]}"
+
+    def go(self, show: Show, hold: Callable[[str], None] | None) -> None:
+        """Start everybody and stay until plant and nodes are done. Raises RunError, or KeyboardInterrupt."""
+        try:
+            for who, spec in self.specs().items():
+                write_spec(spec, self._folder.spec(who))
+                kind = who.split("-")[0]
+                logs = (self._folder.log(who, "jsonl"), self._folder.log(who, "err"))
+                self._supervisor.start(who, kind, self._folder.spec(who), *logs)
+            self._supervisor.watch(lambda: self._look(show), self._design.plant.deadline)
+            if self._record:
+                if hold and (url := self._supervisor.processes["recorder"].said.get("url")):
+                    hold(url)
+                self._supervisor.finish("recorder", CLOSING)
+        finally:
+            for s in self._held:
+                s.close()
+
+    def _look(self, show: Show) -> int:
+        """Show the progress; how many bytes all journals have grown to."""
+        files = {i: self._folder.rows(f"node-{i}") for i in self._sizes}
+        sizes = {i: path.stat().st_size if path.exists() else 0 for i, path in files.items()}
+        steps = {i: size // (8 * self._sizes[i]) for i, size in sizes.items()}
+        errors = {}
+        n = self._design.scenario.plant.n
+        for i, k in steps.items():
+            x = _row(self._folder.rows("plant"), n, k - 1)
+            estimate = _row(files[i], self._sizes[i], k - 1)
+            if x is not None and estimate is not None:
+                errors[i] = float(np.linalg.norm(estimate[:n] - x))
+        show(Progress(min(steps.values()), errors))
+        return sum(sizes.values())
+
+
+def _row(path: Path, size: int, k: int) -> Array | None:
+    """Row k of a journal, or None when it is not there yet."""
+    if k < 0 or not path.exists():
+        return None
+    with path.open("rb") as f:
+        f.seek(8 * size * k)
+        data = f.read(8 * size)
+    return np.frombuffer(data, dtype="<f8") if len(data) == 8 * size else None
+
+
+def run(
+    design: Design,
+    out: str | Path | None = None,
+    *,
+    record: bool = True,
+    live: bool = False,
+    show: Show = ignore,
+    hold: Callable[[str], None] | None = None,
+    supervisor: Supervisor | None = None,
+) -> RunResult:
+    """Run a design as real processes over Zenoh and gather its results into the run folder.
+
+    ``out``: the folder (default runs/<name>/<UTC time>); ``hold`` is called with the live server's address when the
+    nodes are done, and the server stays until it returns; ``supervisor``: one that was started earlier, to save its
+    start-up time. Raises RunError when a process is lost or a deadline passes; the folder then holds what there is.
+    """
+    scenario = design.scenario
+    with supervisor or Supervisor() as supervisor:
+        folder = RunFolder.create(scenario.name, out)
+        write_inputs(folder, design)
+        launch = Launch(design, folder, supervisor, record=record, live=live)
+        begin = time.monotonic()
+        failed = ""
+        try:
+            launch.go(show, hold)
+        except RunError as e:
+            failed = str(e)
+        except KeyboardInterrupt:
+            failed = "interrupted"
+            raise
+        finally:
+            with contextlib.suppress(RunError):  # a nursery that died has taken everybody along
+                supervisor.end()
+            result = gather(folder, design, supervisor, time.monotonic() - begin, failed)
+    if failed:
+        raise RunError(f"{failed} (what there is of the run is in {folder.root})")
+    return result
+
+
+def run_in_process(
+    design: Design, out: str | Path | None = None, *, record: bool = True, show: Show = ignore
+) -> RunResult:
+    """The oracle with the same run folder: no processes, no Zenoh. Raises RunError when the folder cannot be used."""
+    folder = RunFolder.create(design.scenario.name, out)
+    write_inputs(folder, design)
+    begin = time.monotonic()
+    trace = simulate(design, lambda steps: show(Progress(steps, {})))
+    took = time.monotonic() - begin
+    rounds = len(trace.t)
+    return _finish(folder, design, trace, {"rounds": rounds, "rounds_per_second": rounds / took}, record=record)
+
+
+def write_inputs(folder: RunFolder, design: Design) -> None:
+    """scenario.yaml and certificate.json."""
+    (folder.root / "scenario.yaml").write_text(resolved(design.scenario))
+    (folder.root / "certificate.json").write_text(json.dumps(design.certificate, indent=2) + "\n")
+
+
+def resolved(scenario: Scenario) -> str:
+    """The scenario as a topology file of its own, with the versions that ran it."""
+    from duio_mesh import __version__
+    from duio_mesh.scenario import scenario_yaml
+
+    return scenario_yaml(scenario, {"duio_mesh": __version__, "numpy": np.__version__})
+
+
+def gather(folder: RunFolder, design: Design, supervisor: Supervisor, seconds: float, failed: str) -> RunResult:
+    """The result from what the processes left; a recorder that was lost is made good from the trace."""
+    trace = folder.gather(design)
+    said = {who: p.done for who, p in supervisor.processes.items()}
+    nodes = [said[f"node-{i}"] for i in design.nodes if said.get(f"node-{i}")]
+    rounds = max((node["rounds"] for node in nodes), default=0)
+    took = max((node["seconds"] for node in nodes), default=seconds)
+    counts = {
+        "rounds": rounds,
+        "rounds_per_second": rounds / took if took else 0.0,
+        "messages": sum(node["frames"] for node in nodes),
+        "rejected": {who: done["rejected"] for who, done in said.items() if done.get("rejected")},
+        "failure": failed,
+    }
+    recorder = supervisor.processes.get("recorder")
+    warnings = [f"{p.who}: {text}" for p in supervisor.processes.values() for text in p.warnings]
+    lost = recorder is not None and not recorder.done
+    if recorder and lost:
+        warnings.append(f"{recorder.death()}; the recording was made from the trace instead")
+    return _finish(folder, design, trace, counts, record=lost, warnings=tuple(warnings))
+
+
+def _finish(
+    folder: RunFolder,
+    design: Design,
+    trace: Trace,
+    counts: Mapping[str, Any],
+    *,
+    record: bool,
+    warnings: tuple[str, ...] = (),
+) -> RunResult:
+    """trace.npz, metrics.json and, with ``record``, the recording of a finished trace."""
+    write_trace(folder.root / "trace.npz", trace)
+    if record:
+        from duio_mesh.report.recording import record_trace
+
+        record_trace(folder.root / "recording.rrd", design, trace)
+    report = metrics(trace, design.scenario, counts)
+    (folder.root / "metrics.json").write_text(json.dumps(report, indent=2) + "\n")
+    folder.tidy()
+    return RunResult(folder.root, trace, report, bool(report["converged"]), warnings)

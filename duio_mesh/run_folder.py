@@ -1,0 +1,97 @@
+"""The folder of one run: who writes which file, and how it becomes a trace.
+
+scenario.yaml  certificate.json  trace.npz  recording.rrd  metrics.json     written by the launcher (and recorder)
+nodes/node-3.spec  nodes/plant.spec  nodes/recorder.spec                    what each process was given (mode 0600)
+logs/node-3.jsonl  logs/node-3.err                                          events; whatever went to stderr
+rows/node-3.f64    rows/plant.f64                                           removed once trace.npz holds them
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+
+from duio_mesh.arrays import Array
+from duio_mesh.errors import RunError
+from duio_mesh.journal import read_rows
+from duio_mesh.simulation import Trace, estimate_sizes, split_trace
+from duio_mesh.synthesis.design import Design
+
+
+class RunFolder:
+    """Paths of one run."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+
+    @classmethod
+    def create(cls, name: str, out: str | Path | None) -> RunFolder:
+        """Make the folder: exactly ``out``, or runs/<name>/<UTC time> with runs/<name>/latest pointing at it.
+
+        Raises RunError when ``out`` already holds something: a run is never overwritten.
+        """
+        if out is not None:
+            root = Path(out)
+            if root.exists() and (not root.is_dir() or any(root.iterdir())):
+                raise RunError(f"{root} already exists and is not an empty folder; choose another --out")
+            root.mkdir(parents=True, exist_ok=True)
+        else:
+            home = Path("runs") / name
+            home.mkdir(parents=True, exist_ok=True)
+            root = _unused(home / datetime.now(UTC).strftime("%Y-%m-%dT%H-%M-%SZ"))
+            root.mkdir()
+            _point(home / "latest", root.name)
+        folder = cls(root.resolve())
+        for sub in ("nodes", "logs", "rows"):
+            (folder.root / sub).mkdir()
+        return folder
+
+    def spec(self, who: str) -> Path:
+        """The spec file of a process."""
+        return self.root / "nodes" / f"{who}.spec"
+
+    def rows(self, who: str) -> Path:
+        """The journal of a process."""
+        return self.root / "rows" / f"{who}.f64"
+
+    def log(self, who: str, kind: str) -> Path:
+        """The log (kind ``jsonl``) or standard error (``err``) of a process."""
+        return self.root / "logs" / f"{who}.{kind}"
+
+    def gather(self, design: Design) -> Trace:
+        """The trace of all rows that were written; what a process never wrote is NaN."""
+        sizes = estimate_sizes(design)
+        x = read_rows(self.rows("plant"), design.scenario.plant.n)
+        rows = {i: read_rows(self.rows(f"node-{i}"), size) for i, size in sizes.items()}
+        steps = max(map(len, rows.values()))
+        return split_trace(design, _padded(x, steps), {i: _padded(r, steps) for i, r in rows.items()})
+
+    def tidy(self) -> None:
+        """Remove the journals (they are in trace.npz now) and empty files of standard error."""
+        shutil.rmtree(self.root / "rows")
+        for path in (self.root / "logs").glob("*.err"):
+            if path.stat().st_size == 0:
+                path.unlink()
+
+
+def _unused(path: Path) -> Path:
+    """``path``, or path-2, path-3, ... when a run of the same second already has it."""
+    candidates = [path, *(path.with_name(f"{path.name}-{n}") for n in range(2, 1000))]
+    return next(p for p in candidates if not p.exists())
+
+
+def _point(link: Path, target: str) -> None:
+    """Make ``link`` a symbolic link to ``target``, replacing an old one in one step."""
+    fresh = link.with_name(f".{link.name}-{os.getpid()}")
+    fresh.symlink_to(target)
+    fresh.replace(link)
+
+
+def _padded(rows: Array, steps: int) -> Array:
+    """``rows`` cut or filled with NaN to ``steps`` rows."""
+    missing = np.full((max(0, steps - len(rows)), rows.shape[1]), np.nan)
+    return np.vstack([rows[:steps], missing])
