@@ -49,12 +49,8 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--seed", type=int, metavar="S", help="seed of initial state and noise, instead of run.seed")
     p.add_argument("--out", type=Path, metavar="DIR", help="folder for the results (default runs/<name>/<UTC time>)")
     how = p.add_mutually_exclusive_group()
-    how.add_argument(
-        "--in-process", action="store_true", help="one process, no Zenoh: the oracle; same results, bit for bit"
-    )
-    how.add_argument(
-        "--check", action="store_true", help="validate, test the existence conditions, design, start nothing"
-    )
+    how.add_argument("--in-process", action="store_true", help="the oracle: one process, no Zenoh, the same bits")
+    how.add_argument("--check", action="store_true", help="validate, check the theory, design, start nothing")
     how.add_argument("--dry-run", action="store_true", help="print what would be started")
     p.add_argument("--live", action="store_true", help="also serve the recording to a Rerun viewer on this host")
     p.add_argument("--plot", action="store_true", help="write PNG figures of the errors and states into the results")
@@ -101,9 +97,7 @@ def _main(args: argparse.Namespace) -> int:
     overrides = args.overrides + [f"{path}={value}" for path, value in flags.items() if value is not None]
     scenario = load_scenario(args.topology, overrides, options_of=synthesis.options_of)
     if args.out and args.out.exists() and (not args.out.is_dir() or any(args.out.iterdir())):
-        raise ScenarioError(
-            [f"--out {args.out}: already exists and is not an empty folder; a run is never overwritten"]
-        )
+        raise ScenarioError([f"--out {args.out}: already exists and is not empty; a run is never overwritten"])
 
     from duio_mesh import console
 

@@ -120,9 +120,7 @@ def plan(design: Design, *, record: bool) -> None:
     if record:
         table.add_row("duio-recorder", "python -m duio_mesh.recorder --spec nodes/recorder.spec", "everybody", "")
     _out.print(table)
-    _out.print(
-        f"{design.plant.steps} steps; peers on loopback, links only along the edges, to the plant and the recorder"
-    )
+    _out.print(f"{design.plant.steps} steps; links on loopback, along the edges, to the plant and to the recorder only")
 
 
 def _number(value: float | None) -> str:

@@ -1,7 +1,7 @@
 """The life of the recorder process: what plant and nodes publish, into a Rerun recording.
 
-It dials everybody and nobody waits for it. What it missed (it came late, was slow, or a batch was dropped) it reads from
-the processes' own journals at the end, so a finished recording is complete.
+It dials everybody and nobody waits for it. What it missed (it came late, was slow, or a batch was dropped) it reads
+from the processes' own journals at the end, so a finished recording is complete.
 """
 
 from __future__ import annotations

@@ -118,7 +118,8 @@ class Mesh:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
-        self._session.close()  # always: a live subscriber would keep the interpreter from ever exiting
+        # always: a live subscriber would keep the interpreter from ever exiting
+        self._session.close()  # type: ignore[no-untyped-call]
 
     # -- declaring --------------------------------------------------------------------------------------------------
 
@@ -179,7 +180,8 @@ class Mesh:
 
         Raises RunError naming the links that nobody answered.
         """
-        matched, news = set(), SimpleQueue[str]()
+        matched: set[str] = set()
+        news = SimpleQueue[str]()
         for name, publisher in self._meeting.items():
             self._kept.append(
                 publisher.declare_matching_listener(lambda s, name=name: news.put(name) if s.matching else None)
