@@ -3,34 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from duio_mesh.arrays import Array
 from duio_mesh.dynamics import Plant
 from duio_mesh.observers import make_observer
 from duio_mesh.synthesis.design import Design
-
-
-@dataclass(frozen=True)
-class Trace:
-    """A run as arrays: what trace.npz holds. Rows that a lost process never wrote are NaN."""
-
-    t: Array  # (K,) seconds
-    x: Array  # (K, n) the truth
-    node_ids: NDArray[np.int64]  # (N,)
-    xhat: Array  # (N, K, n), xhat[i, k] estimates x[k]
-    what: Array | None = None  # (N, K, q) where the method reconstructs the unknown input
-    vhat: dict[int, Array] = field(default_factory=dict)  # node id -> (K, r) where it reconstructs its noise
-
-    def arrays(self) -> dict[str, NDArray[np.generic]]:
-        """The arrays under the names of trace.npz."""
-        named: dict[str, NDArray[np.generic]] = {"t": self.t, "x": self.x, "node_ids": self.node_ids, "xhat": self.xhat}
-        if self.what is not None:
-            named["what"] = self.what
-        return named | {f"vhat_{i}": v for i, v in self.vhat.items()}
+from duio_mesh.trace import Trace as Trace  # re-exported: it lives lower, where report/ may import it
 
 
 def simulate(design: Design, progress: Callable[[int], None] = lambda _: None) -> Trace:

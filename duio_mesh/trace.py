@@ -1,0 +1,29 @@
+"""A run as arrays: what trace.npz holds (``report/trace_file.py`` reads and writes it)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from duio_mesh.arrays import Array
+
+
+@dataclass(frozen=True)
+class Trace:
+    """A run as arrays: what trace.npz holds. Rows that a lost process never wrote are NaN."""
+
+    t: Array  # (K,) seconds
+    x: Array  # (K, n) the truth
+    node_ids: NDArray[np.int64]  # (N,)
+    xhat: Array  # (N, K, n), xhat[i, k] estimates x[k]
+    what: Array | None = None  # (N, K, q) where the method reconstructs the unknown input
+    vhat: dict[int, Array] = field(default_factory=dict)  # node id -> (K, r) where it reconstructs its noise
+
+    def arrays(self) -> dict[str, NDArray[np.generic]]:
+        """The arrays under the names of trace.npz."""
+        named: dict[str, NDArray[np.generic]] = {"t": self.t, "x": self.x, "node_ids": self.node_ids, "xhat": self.xhat}
+        if self.what is not None:
+            named["what"] = self.what
+        return named | {f"vhat_{i}": v for i, v in self.vhat.items()}
