@@ -1,0 +1,82 @@
+"""metrics.json: how good the estimates are, and whether that is good enough.
+
+An error is measured per component: the RMS of node i over a set of steps is
+
+    sqrt( mean over the steps k and over the n components of (x-hat_i(k) - x(k))^2 ),
+
+in the unit of the states. (So it does not grow with n, and can be compared with the noise of one sensor. It is the
+2-norm's RMS divided by sqrt(n); the levels of seed 000's examples are given in this convention.)
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from duio_mesh.arrays import Array
+from duio_mesh.scenario.model import Convergence, Scenario
+from duio_mesh.trace import Trace
+
+
+def metrics(trace: Trace, scenario: Scenario, counts: Mapping[str, Any]) -> dict[str, Any]:
+    """What metrics.json holds, plain data that JSON can say.
+
+    ``counts`` is what the run itself counted (rounds, rounds_per_second, messages, faults, ...), passed on as it is.
+    A node's ``rms`` is over the steps of the verdict, its ``final`` at the last step, both per component; null where it
+    has no finite estimate (a lost process, a diverged observer). A run that ended early is ``incomplete`` and has not
+    converged, however small its errors were.
+    """
+    wanted = scenario.run.convergence
+    window = judged(trace, wanted)
+    rms, final = rms_errors(trace, window), rms_errors(trace, slice(-1, None))
+    complete = len(trace.t) >= scenario.run.steps and not np.isnan(trace.xhat).any()
+    good = complete and converged(trace, wanted)
+    return {
+        "verdict": "converged" if good else "not converged" if complete else "incomplete",
+        "converged": good,
+        "criterion": {"rms_below": wanted.rms_below, "from_step": window.start},
+        "nodes": {
+            str(i): {"rms": _finite(rms[at]), "final": _finite(final[at])}
+            for at, i in enumerate(trace.node_ids.tolist())
+        },
+        "steps": len(trace.t),
+        "seed": scenario.run.seed,
+        **counts,
+        "estimates_sha256": hashlib.sha256(trace.xhat.astype("<f8", order="C", copy=False).tobytes()).hexdigest(),
+    }
+
+
+def converged(trace: Trace, convergence: Convergence) -> bool:
+    """Whether every node's RMS error over the last part of the run is below the limit; a NaN or no step never is."""
+    if not len(trace.t):
+        return False
+    return bool(np.all(rms_errors(trace, judged(trace, convergence)) < convergence.rms_below))
+
+
+def judged(trace: Trace, convergence: Convergence) -> slice:
+    """The steps that the verdict looks at: the last ``over_last`` of the run, at least one."""
+    K = len(trace.t)
+    return slice(max(0, K - max(1, round(K * convergence.over_last))), K)
+
+
+def rms_errors(trace: Trace, steps: slice) -> Array:
+    """(N,) RMS error per component of every node over these steps; NaN where any estimate is NaN or there is no step.
+
+    Scaled by the largest error, so that an observer that diverged gives a large number and no overflow.
+    """
+    with np.errstate(over="ignore", invalid="ignore"):  # inf - inf of a run that left the floats is NaN, and says so
+        error = trace.xhat[:, steps] - trace.x[steps]
+        largest = np.max(np.abs(error), axis=(1, 2), initial=0.0)
+        scale = np.where(largest > 0, largest, 1.0)
+        scaled = error / scale[:, None, None]
+        if not scaled.shape[1]:
+            return np.full(len(trace.node_ids), np.nan)
+        return np.asarray(scale * np.sqrt(np.mean(scaled**2, axis=(1, 2))))
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None
