@@ -33,6 +33,7 @@ def metrics(trace: Trace, scenario: Scenario, counts: Mapping[str, Any]) -> dict
     wanted = scenario.run.convergence
     window = judged(trace, wanted)
     rms, final = rms_errors(trace, window), rms_errors(trace, slice(-1, None))
+    ids = trace.node_ids.tolist()
     complete = len(trace.t) >= scenario.run.steps and not np.isnan(trace.xhat).any()
     good = complete and converged(trace, wanted)
     return {
