@@ -40,10 +40,7 @@ def metrics(trace: Trace, scenario: Scenario, counts: Mapping[str, Any]) -> dict
         "verdict": "converged" if good else "not converged" if complete else "incomplete",
         "converged": good,
         "criterion": {"rms_below": wanted.rms_below, "from_step": window.start},
-        "nodes": {
-            str(i): {"rms": _finite(rms[at]), "final": _finite(final[at])}
-            for at, i in enumerate(trace.node_ids.tolist())
-        },
+        "nodes": {str(i): {"rms": _finite(rms[at]), "final": _finite(final[at])} for at, i in enumerate(ids)},
         "steps": len(trace.t),
         "seed": scenario.run.seed,
         **counts,
