@@ -127,7 +127,7 @@ def stabilise(C: Array, A: Array, stability: Stability, max_gain: float = MAX_GA
             M = -np.linalg.solve(R, C @ X).T
     except linalg.LinAlgError as e:
         raise GeometryError(f"no stabilising output injection exists for this pair and {stability} ({e})") from None
-    limit = max_gain * max(norm(A), 1e-300) / max(norm(C), 1e-300)
+    limit = max_gain * max(norm(A), abs(stability.bound), 1e-300) / max(norm(C), 1e-300)
     values = np.linalg.eigvals(A + M @ C)
     if not stability.stable(values) or norm(M) > limit:
         raise GeometryError(

@@ -23,7 +23,6 @@ from duio_mesh.geometry.subspace import (
     RTOL,
     GeometryError,
     Rank,
-    add,
     add_with_margin,
     as_matrix,
     as_pair,
@@ -54,7 +53,7 @@ class InputStructure:
     L: Array  # (n, p) the friend of smallest norm of W*, hence of W*_g and S* too
     zeros: NDArray[np.complex128]  # (s - w,) invariant zeros, the bad ones first
     bad: NDArray[np.complex128]  # (b,) those outside the stability region
-    rank: Rank  # the least clear decision about W*, relative to ||A||_2
+    margin: Rank  # the least clear decisions about W* and S*, relative to 1 or ||A||_2 (rank: no meaning here)
 
 
 def infimal_invariant(C: Array, A: Array, B: Array, rtol: float = RTOL) -> Array:
@@ -82,13 +81,19 @@ def infimal_unobservability(C: Array, A: Array, W: Array, rtol: float = RTOL) ->
 
     Raises GeometryError when the recursion has not settled after n + 2 steps; in exact arithmetic it needs at most n.
     """
+    return _infimal_unobservability(C, A, W, rtol)[0]
+
+
+def _infimal_unobservability(C: Array, A: Array, W: Array, rtol: float) -> tuple[Array, Rank]:
     n, size = A.shape[0], norm(A)
-    K, S = kernel(unit_rows(C, rtol), rtol, scale=1.0), np.eye(A.shape[0])
+    K, margin = kernel_with_margin(unit_rows(C, rtol), rtol, scale=1.0)
+    S: Array = np.eye(n)
     for _ in range(n + 2):
-        back = K @ kernel(residual(S, A @ K), rtol, scale=size)
-        smaller = add(W, back, rtol)
+        back, decided = kernel_with_margin(residual(S, A @ K), rtol, scale=size)
+        smaller, added = add_with_margin(W, K @ back, rtol)
+        margin = margin.worst(decided).worst(added)
         if gap(smaller, S) <= np.sqrt(rtol):
-            return smaller
+            return smaller, margin
         S = smaller
     raise GeometryError(
         f"the unobservability subspace did not settle within {n + 2} steps at rtol = {rtol:g}: the matrices probably "
@@ -124,11 +129,11 @@ def unknown_input_structure(C: Array, A: Array, B: Array, stability: Stability, 
     C, A = as_pair(C, A)
     B = as_matrix("B", B, rows=A.shape[0])
     W, decided = _infimal_invariant(C, A, B, rtol)
-    S = infimal_unobservability(C, A, W, rtol)
+    S, also = _infimal_unobservability(C, A, W, rtol)
     L = friend(C, A, W, rtol)
     Q = image(residual(W, S), rtol, scale=1.0)  # orthonormal, represents S*/W*
     if excess(W, S) > np.sqrt(rtol) or Q.shape[1] != S.shape[1] - W.shape[1]:
         raise GeometryError(f"the unobservability subspace lost a part of W* at rtol = {rtol:g}; choose another rtol")
     Z, bad, good = split_spectrum(Q.T @ (A + L @ C) @ Q, stability)
     V = Q @ Z
-    return InputStructure(W, S, V, np.hstack([W, V]), L, np.concatenate([bad, good]), bad, decided)
+    return InputStructure(W, S, V, np.hstack([W, V]), L, np.concatenate([bad, good]), bad, decided.worst(also))
