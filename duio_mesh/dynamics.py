@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from duio_mesh.arrays import Array
-from duio_mesh.spec import PlantSpec
+from duio_mesh.spec import PlantSpec, SensorSpec
 
 # one independent random stream per purpose and node: adding a node changes nobody else's noise
 _STATE, _CONTROL, _DISTURBANCE, _NOISE = range(4)
@@ -51,7 +51,7 @@ class Plant:
     def __init__(self, spec: PlantSpec) -> None:
         self.spec = spec
         self.k = 0
-        self._noise = {s.id: _stream(spec, _NOISE, s.id) for s in spec.sensors}
+        self._sensors = _Sensors(spec)
         self._motion = _Recursion(spec) if spec.time == "discrete" else _Flow(spec)
         if "value" in spec.x0:
             self.x = spec.x0["value"].copy()
@@ -62,13 +62,8 @@ class Plant:
 
     def sample(self) -> dict[int, Array]:
         """[y_i(k); u_i(k)] for every node: what the plant process sends."""
-        t, spec = self.k * self.spec.step, self.spec
         self.u = self._motion.input(self.k, self.x)
-        data = {}
-        for s in spec.sensors:
-            y = s.C @ self.x + s.channel @ signals(s.noise, t, self._noise[s.id])
-            data[s.id] = np.concatenate([y, self.u[list(s.known)]])
-        return data
+        return self._sensors.measure(self.k, self.x, self.u)
 
     def advance(self) -> None:
         """From x(k) to x(k+1), under the input whose value at k ``sample`` announced."""
@@ -78,6 +73,46 @@ class Plant:
 
 def _stream(spec: PlantSpec, *purpose: int) -> np.random.Generator:
     return np.random.default_rng([spec.seed, *purpose])
+
+
+class _Sensors:
+    """All sensors at once: one product for all C_i x, and the noise drawn a block of steps at a time.
+
+    The draws come in the same order as one by one: step by step, each sensor from its own stream.
+    """
+
+    BLOCK = 64  # steps
+
+    def __init__(self, spec: PlantSpec) -> None:
+        self._spec = spec
+        self._C = np.vstack([s.C for s in spec.sensors])
+        self._streams = [_stream(spec, _NOISE, s.id) for s in spec.sensors]
+        ends = np.cumsum([s.C.shape[0] for s in spec.sensors])
+        inputs = self._C.shape[0]  # u stands behind all measurements
+        self._parts = {
+            s.id: np.array([*range(end - s.C.shape[0], end), *(inputs + j for j in s.known)])
+            for s, end in zip(spec.sensors, ends, strict=True)
+        }
+        self._noise = np.zeros((0, self._C.shape[0]))
+
+    def measure(self, k: int, x: Array, u: Array) -> dict[int, Array]:
+        """[y_i(k); u_i(k)] for every node; to be called for k = 0, 1, 2, ..."""
+        if k % self.BLOCK == 0:
+            self._noise = np.hstack(
+                [self._draw(k, *pair) for pair in zip(self._spec.sensors, self._streams, strict=True)]
+            )
+        known = np.concatenate([self._C @ x + self._noise[k % self.BLOCK], u])
+        return {i: known[part] for i, part in self._parts.items()}
+
+    def _draw(self, k: int, sensor: SensorSpec, stream: np.random.Generator) -> Array:
+        """F_i v_i of the steps k .. k + BLOCK - 1 (BLOCK, p_i)."""
+        if all(len(terms) == 1 and set(terms[0]) == {"normal"} for terms in sensor.noise):
+            mean, std = (np.array([terms[0]["normal"][name] for terms in sensor.noise]) for name in ("mean", "std"))
+            v = mean + std * stream.standard_normal((self.BLOCK, len(sensor.noise)))
+        else:
+            times = [(k + ahead) * self._spec.step for ahead in range(self.BLOCK)]
+            v = np.array([signals(sensor.noise, t, stream) for t in times])
+        return v @ sensor.channel.T
 
 
 class _Recursion:

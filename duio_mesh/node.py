@@ -20,7 +20,6 @@ from duio_mesh.process import Report, main
 from duio_mesh.spec import NodeSpec
 
 NO_VECTOR = np.zeros(0)
-EDGE_AHEAD = 2  # a neighbour can be one round ahead of us, and we one behind what we last used
 
 
 def run(spec: NodeSpec, report: Report) -> None:
@@ -29,7 +28,7 @@ def run(spec: NodeSpec, report: Report) -> None:
     observer = make_observer(spec)
     with Mesh(spec.wire, f"node-{i}", report.warn) as mesh:
         keys = mesh.keys
-        plant = mesh.hear(keys.plant(i), f"plant -> {i}", "plant", ready=("plant", i))
+        plant = mesh.hear(keys.plant(i), f"plant -> {i}", "plant", ready=("plant", i), ahead=spec.window)
         heard = {
             j: mesh.hear(keys.edge(j, i), f"edge {j} -> {i}", f"node-{j}", ready=(j, i)) for j in sorted(spec.hears)
         }
@@ -39,18 +38,17 @@ def run(spec: NodeSpec, report: Report) -> None:
         mesh.watch()
         mesh.meet()
         report("ready")
-        samples = Lockstep(mesh, spec.deadline, spec.window)
-        edges = Lockstep(mesh, spec.deadline, EDGE_AHEAD)
+        lockstep = Lockstep(mesh, spec.deadline)
         row = sum(part.size for part in observer.estimate())
         rounds, begin = 0, time.monotonic()
         with Journal(spec.output, row, trace) as journal:
             for k in range(spec.steps):
-                sample = samples.take(plant, k, 0, p + spec.m)
+                sample = lockstep.take(plant, k, 0, p + spec.m)
                 observer.sample(sample[:p], sample[p:])
                 for r in range(observer.rounds):
                     out = observer.message(r)
                     told.send(k, r, out)
-                    observer.exchange(r, {j: edges.take(source, k, r, out.size) for j, source in heard.items()})
+                    observer.exchange(r, {j: lockstep.take(source, k, r, out.size) for j, source in heard.items()})
                     rounds += 1
                 estimate = observer.estimate()
                 if not np.isfinite(estimate.state).all():

@@ -102,6 +102,7 @@ class RecorderSpec:
     description: str  # markdown for the recording's first tab
     truth: str  # the plant's output file and ...
     estimates: Mapping[int, str]  # ... the nodes': rows that never arrived are read from here at the end
+    unknown_inputs: int = 0  # of a row's columns after the n states, so many estimate w; the rest the node's own noise
     wire: Wire = UNWIRED
 
 

@@ -5,8 +5,8 @@ It knows frames and names, not observers: floats go in and come out with a step 
 
 from __future__ import annotations
 
-from duio_mesh.mesh.frames import Encoder, Frame, Rejected, decode
+from duio_mesh.mesh.frames import Decoder, Encoder, Frame, Rejected
 from duio_mesh.mesh.keys import Keys
 from duio_mesh.mesh.session import Mesh, Outlet, Source
 
-__all__ = ["Encoder", "Frame", "Keys", "Mesh", "Outlet", "Rejected", "Source", "decode"]
+__all__ = ["Decoder", "Encoder", "Frame", "Keys", "Mesh", "Outlet", "Rejected", "Source"]

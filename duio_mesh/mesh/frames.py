@@ -8,6 +8,7 @@ checksum (crc32 of everything before it) makes a flipped bit a refusal, too. Not
 from __future__ import annotations
 
 import struct
+from math import isfinite
 from typing import NamedTuple
 from zlib import crc32
 
@@ -23,6 +24,8 @@ _STAMP = struct.Struct(">BIBI")  # uint32 k, uint32 r in msgpack's 0xce form
 _UINT32 = 0xCE
 _CHECK = struct.Struct(">HI")  # bin8 of four bytes: the checksum
 _BIN8_OF_4 = 0xC404
+_FLOAT64 = np.dtype("<f8")
+_LAYOUTS = 16  # frame lengths that a decoder remembers
 _BIN_HEADERS = ((0xC4, ">BB", 1 << 8), (0xC5, ">BH", 1 << 16), (0xC6, ">BI", 1 << 32))
 
 
@@ -70,29 +73,64 @@ class Encoder:
         return body + _CHECK.pack(_BIN8_OF_4, crc32(body))
 
 
-def decode(data: bytes, expected: bytes) -> Frame:
-    """Read a frame whose constant part must be ``expected`` (see ``prefix``).
+class Decoder:
+    """Reads the frames of one source of one run."""
 
-    Raises Rejected for anything that ``Encoder`` would not have written: truncation, another version, run or source,
-    a wrong checksum, a payload that is not whole float64 numbers or not finite.
-    """
-    at = len(expected)
-    if not data.startswith(expected):
-        raise Rejected("not from the expected source, run and version")
-    end = len(data) - _CHECK.size
-    head = at + _STAMP.size
-    if end < head + 2:
-        raise Rejected("truncated")
-    mark, check = _CHECK.unpack_from(data, end)
-    if mark != _BIN8_OF_4 or check != crc32(memoryview(data)[:end]):
-        raise Rejected("checksum")
-    k_form, k, r_form, r = _STAMP.unpack_from(data, at)
-    code = data[head]
-    start = head + (2 if code == 0xC4 else 3 if code == 0xC5 else 5)
-    size = end - start
-    if k_form != _UINT32 or r_form != _UINT32 or size < 0 or size % 8 or data[head:start] != _bin_header(size):
-        raise Rejected("layout")
-    vector = np.frombuffer(data, dtype="<f8", count=size // 8, offset=start)
-    if not np.isfinite(vector).all():
-        raise Rejected("not finite")
-    return Frame(k, r, vector)
+    def __init__(self, run: str, source: str) -> None:
+        self._prefix = prefix(run, source)
+        self._layouts: dict[int, _Layout] = {}  # by length of the frame
+
+    def __call__(self, data: bytes) -> Frame:
+        """Read one frame.
+
+        Raises Rejected for anything that ``Encoder`` would not have written: truncation, another version, run or
+        source, a wrong checksum, a payload that is not whole float64 numbers or not finite.
+        """
+        layout = self._layouts.get(len(data)) or self._learn(data)
+        front, k_form, k, r_form, r, header = layout.head.unpack_from(data)
+        if front != self._prefix:
+            raise Rejected("not from the expected source, run and version")
+        mark, check = _CHECK.unpack_from(data, layout.end)
+        if mark != _BIN8_OF_4 or check != crc32(memoryview(data)[: layout.end]):
+            raise Rejected("checksum")
+        if k_form != _UINT32 or r_form != _UINT32 or header != layout.header:
+            raise Rejected("layout")
+        if not all(map(isfinite, layout.payload.unpack_from(data, layout.start))):
+            raise Rejected("not finite")
+        return Frame(k, r, np.frombuffer(data, _FLOAT64, layout.count, layout.start))
+
+    def _learn(self, data: bytes) -> _Layout:
+        """The layout of frames of this length; a length that no payload gives is refused."""
+        if not data.startswith(self._prefix):
+            raise Rejected("not from the expected source, run and version")
+        head = len(self._prefix) + _STAMP.size
+        rest = len(data) - head - _CHECK.size
+        for code, form, limit in _BIN_HEADERS:
+            size = rest - struct.calcsize(form)
+            if 0 <= size < limit and size % 8 == 0 and _bin_header(size)[0] == code:
+                break
+        else:
+            raise Rejected("truncated")
+        header = _bin_header(size)
+        layout = _Layout(
+            head=struct.Struct(f">{len(self._prefix)}sBIBI{len(header)}s"),
+            header=header,
+            start=head + len(header),
+            count=size // 8,
+            payload=struct.Struct(f"<{size // 8}d"),
+            end=head + len(header) + size,
+        )
+        if len(self._layouts) < _LAYOUTS:  # who sends frames of every length shall not fill our memory
+            self._layouts[len(data)] = layout
+        return layout
+
+
+class _Layout(NamedTuple):
+    """Where everything is in a frame of one length."""
+
+    head: struct.Struct  # prefix, k, r, header of the payload
+    header: bytes
+    start: int  # of the payload
+    count: int  # of its numbers
+    payload: struct.Struct
+    end: int  # of the payload; the checksum follows

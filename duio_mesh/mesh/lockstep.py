@@ -17,9 +17,9 @@ from duio_mesh.mesh.session import Mesh, Source
 class Lockstep:
     """Takes frames in order from the sources of one mesh."""
 
-    def __init__(self, mesh: Mesh, deadline: float, steps_ahead: int) -> None:
-        """``steps_ahead``: how many steps a source may run ahead (the plant's window; edges need only two)."""
-        self._mesh, self._deadline, self._ahead = mesh, deadline, steps_ahead
+    def __init__(self, mesh: Mesh, deadline: float) -> None:
+        """``deadline``: seconds that any one wait may last."""
+        self._mesh, self._deadline = mesh, deadline
 
     def take(self, source: Source, k: int, r: int, size: int) -> Array:
         """The vector (size,) of step k, round r from this source, waiting for it if need be.
@@ -53,7 +53,7 @@ class Lockstep:
         step, turn = source.taken
         if (k, r) <= (step, turn) or (k, r) in source.waiting:
             self._mesh.reject(source, "seen before")
-        elif k - step > self._ahead or r - (turn if k == step else -1) > 2:
+        elif k - step > source.ahead or r - (turn if k == step else -1) > 2:
             self._mesh.reject(source, "too far ahead")
         else:
             source.waiting[k, r] = vector

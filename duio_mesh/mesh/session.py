@@ -27,11 +27,12 @@ import zenoh
 
 from duio_mesh.arrays import Array
 from duio_mesh.errors import RunError
-from duio_mesh.mesh.frames import Encoder, Frame, Rejected, decode, prefix
+from duio_mesh.mesh.frames import Decoder, Encoder, Frame, Rejected
 from duio_mesh.mesh.keys import Keys
 from duio_mesh.spec import START, Wire
 
 Ready: TypeAlias = tuple[int | str, int | str]  # (source, target) of a link, for the start barrier
+ONE_ROUND = 2  # steps: a neighbour can be a round ahead of us, and we one behind what we last used
 
 
 def _config(wire: Wire) -> zenoh.Config:
@@ -57,10 +58,11 @@ def _config(wire: Wire) -> zenoh.Config:
 class Source:
     """One incoming key: who sends on it, what it has sent, and what of it was refused."""
 
-    def __init__(self, name: str, who: str, expected: bytes) -> None:
+    def __init__(self, name: str, who: str, decode: Decoder, ahead: int) -> None:
         self.name = name  # as the user knows it: "edge 3 -> 2"
         self.who = who  # the process: "node-3"
-        self.expected = expected
+        self.decode = decode
+        self.ahead = ahead
         self.last: tuple[int, int] | None = None  # (k, r) of the newest good frame
         self.rejected: Counter[str] = Counter()
         self.gone = False
@@ -123,9 +125,12 @@ class Mesh:
 
     # -- declaring --------------------------------------------------------------------------------------------------
 
-    def hear(self, key: str, name: str, who: str, ready: Ready | None = None) -> Source:
-        """Subscribe to ``key``, on which the process ``who`` sends; ``ready`` names the link for the start barrier."""
-        source = Source(name, who, prefix(self.keys.run, who))
+    def hear(self, key: str, name: str, who: str, ready: Ready | None = None, ahead: int = ONE_ROUND) -> Source:
+        """Subscribe to ``key``, on which the process ``who`` sends; ``ready`` names the link for the start barrier.
+
+        ``ahead``: how many steps it may be ahead of the step last used (lockstep; the plant's window is larger).
+        """
+        source = Source(name, who, Decoder(self.keys.run, who), ahead)
         self._sources.append(source)
         put, pin = self._queue.put, self._pin
 
@@ -211,7 +216,7 @@ class Mesh:
                     s.gone = s.gone or s.who == source
                 return None
             try:
-                frame = decode(data, source.expected)  # type: ignore[arg-type]
+                frame = source.decode(data)  # type: ignore[arg-type]
             except Rejected as e:
                 self.reject(source, e.cause)
                 continue

@@ -12,14 +12,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from duio_mesh.mesh.frames import LIMIT, Encoder, Frame, Rejected, decode, prefix
+from duio_mesh.mesh.frames import LIMIT, Decoder, Encoder, Frame, Rejected
 
 VECTOR = np.array([1.0, -2.5, 1e-300, 3.141592653589793])
 
 
-def refused(data: bytes, expected: bytes) -> str:
+def refused(data: bytes, decode: Decoder) -> str:
     with pytest.raises(Rejected) as e:
-        decode(data, expected)
+        decode(data)
     return e.value.cause
 
 
@@ -39,7 +39,7 @@ def test_any_msgpack_reader_reads_a_frame() -> None:
 )
 def test_what_is_written_is_read_to_the_bit(k: int, r: int, values: list[float]) -> None:
     vector = np.array(values, dtype=float)
-    frame = decode(Encoder("run", "plant")(k, r, vector), prefix("run", "plant"))
+    frame = Decoder("run", "plant")(Encoder("run", "plant")(k, r, vector))
     assert frame[:2] == (k, r)
     assert frame.vector.tobytes() == vector.tobytes()
 
@@ -47,25 +47,25 @@ def test_what_is_written_is_read_to_the_bit(k: int, r: int, values: list[float])
 @pytest.mark.parametrize("size", [0, 1, 31, 32, 8191, 8192, 100_000])
 def test_every_payload_header_form(size: int) -> None:
     vector = np.arange(float(size))
-    frame = decode(Encoder("run", "plant")(1, 0, vector), prefix("run", "plant"))
+    frame = Decoder("run", "plant")(Encoder("run", "plant")(1, 0, vector))
     assert np.array_equal(frame.vector, vector)
 
 
 def test_a_block_of_rows_travels_row_by_row() -> None:
     rows = np.arange(6.0).reshape(2, 3)
-    assert np.array_equal(decode(Encoder("a", "b")(0, 0, rows), prefix("a", "b")).vector, rows.ravel())
+    assert np.array_equal(Decoder("a", "b")(Encoder("a", "b")(0, 0, rows)).vector, rows.ravel())
 
 
 def test_wrong_run_source_or_version_is_refused() -> None:
     data = Encoder("run", "node-1")(1, 0, VECTOR)
-    for other in (prefix("other", "node-1"), prefix("run", "node-2")):
+    for other in (Decoder("other", "node-1"), Decoder("run", "node-2")):
         assert refused(data, other) == "not from the expected source, run and version"
-    assert refused(data[:1] + b"\x02" + data[2:], prefix("run", "node-1")).startswith("not from the expected")
+    assert refused(data[:1] + b"\x02" + data[2:], Decoder("run", "node-1")).startswith("not from the expected")
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_numbers_that_are_not_finite_are_refused(value: float) -> None:
-    assert refused(Encoder("run", "p")(1, 0, np.array([1.0, value])), prefix("run", "p")) == "not finite"
+    assert refused(Encoder("run", "p")(1, 0, np.array([1.0, value])), Decoder("run", "p")) == "not finite"
 
 
 def test_a_frame_in_another_msgpack_form_is_refused() -> None:
@@ -73,13 +73,13 @@ def test_a_frame_in_another_msgpack_form_is_refused() -> None:
     body = b"\x97" + b"".join(msgpack.packb(f) for f in (1, "run", "p", 7, 0, VECTOR.tobytes()))
     data = body + msgpack.packb(crc32(body).to_bytes(4, "big"))
     assert msgpack.unpackb(data)[3] == 7
-    assert refused(data, prefix("run", "p")) == "layout"
+    assert refused(data, Decoder("run", "p")) == "layout"
 
 
 def test_twenty_thousand_mutated_frames_are_refused_and_counted() -> None:
     """Flipped bits, cuts, insertions, swaps and noise: no crash, none accepted."""
     rng = random.Random(0)
-    expected, encode = prefix("run", "node-1"), Encoder("run", "node-1")
+    decode, encode = Decoder("run", "node-1"), Encoder("run", "node-1")
     causes: Counter[str] = Counter()
     for n in range(20_000):
         good = encode(n, n % 5, VECTOR * n)
@@ -96,7 +96,7 @@ def test_twenty_thousand_mutated_frames_are_refused_and_counted() -> None:
         else:
             data = bytearray(rng.randbytes(rng.randint(0, 200)))
         if bytes(data) != good:
-            causes[refused(bytes(data), expected)] += 1
+            causes[refused(bytes(data), decode)] += 1
     assert sum(causes.values()) > 19_990
     assert set(causes) <= {
         "not from the expected source, run and version",
@@ -108,7 +108,7 @@ def test_twenty_thousand_mutated_frames_are_refused_and_counted() -> None:
 
 
 def test_a_received_vector_cannot_be_changed() -> None:
-    frame = decode(Encoder("run", "p")(1, 0, VECTOR), prefix("run", "p"))
+    frame = Decoder("run", "p")(Encoder("run", "p")(1, 0, VECTOR))
     assert isinstance(frame, Frame)
     with pytest.raises(ValueError, match="read-only"):
         frame.vector[0] = 1.0
