@@ -1,0 +1,180 @@
+"""How a recording looks in the Rerun viewer: its tabs, views and styles. All unstable parts of Rerun's API are here."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+
+from duio_mesh.report.entities import DESCRIPTION, EVENTS, RATES, STATES, TRUTH, Entities, spread
+from duio_mesh.report.topology import positions
+
+VIEWS = 12  # states that are shown side by side
+LINES = 16  # nodes whose lines share a view, and nodes with a tab of their own
+LEGEND = 16  # lines that a legend names
+NODE, RING, EDGE = 0.16, 0.23, 0.035  # radii in the topology view, where neighbours are about 1 apart
+
+
+def blueprint(entities: Entities, *, rates: bool) -> rrb.Blueprint:
+    """Tabs: overview, estimates, what else is reconstructed, the run. ``rates``: whether the recording has any."""
+    tabs = [_overview(entities), _estimates(entities), *_reconstruction(entities), _run(rates)]
+    return rrb.Blueprint(
+        rrb.Tabs(*tabs, active_tab=0),
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+        rrb.TimePanel(state="collapsed", timeline="sim_time", play_state="following"),
+        auto_views=False,
+        auto_layout=False,
+    )
+
+
+def styles(entities: Entities, description: str) -> Iterator[tuple[str, Any]]:
+    """Everything that does not change with time: (entity path, archetype)."""
+    yield DESCRIPTION, rr.TextDocument(description, media_type=rr.MediaType.MARKDOWN)
+    for _, path in entities.truth:
+        yield path, _line("truth", TRUTH, 4.0)
+    for i in entities.ids:
+        yield entities.error(i), _line(f"node {i}", entities.colours[i], 1.5)
+        for column, path in entities.estimates(i):
+            own = path.startswith("/noise")
+            name = path.rsplit("/", 1)[1] if own else f"node {i}"
+            yield path, _line(name, entities.colours[i] if not own or column == 0 else None, 1.5)
+    lanes = rr.StateConfiguration(values=list(STATES), colors=np.array(list(STATES.values()), dtype=np.uint32))
+    for who in ("plant", *(f"node-{i}" for i in entities.ids)):
+        yield entities.alive(who), lanes
+    yield from _map(entities)
+
+
+def states(values: list[str]) -> Any:
+    """How a process is, as a column of its lane."""
+    return rr.StateChange.columns(state=values)
+
+
+def node_colours(colours: list[int]) -> Any:
+    """Colours of a node's ring in the topology view, as a column."""
+    return rr.Points2D.columns(colors=np.array(colours, dtype=np.uint32))
+
+
+def edge_colours(colours: list[int], *, both_ways: bool) -> Any:
+    """Colours of an edge in the topology view, as a column."""
+    kind = rr.LineStrips2D if both_ways else rr.Arrows2D
+    return kind.columns(colors=np.array(colours, dtype=np.uint32))
+
+
+def _line(name: str, colour: int | None, width: float) -> rr.SeriesLines:
+    # MinMax: where a pixel covers many steps both extremes are drawn; an average would wash a spike out
+    colours = None if colour is None else np.array([colour], dtype=np.uint32)
+    return rr.SeriesLines(
+        names=[name], colors=colours, widths=[width], aggregation_policy=rr.components.AggregationPolicy.MinMax
+    )
+
+
+def _map(entities: Entities) -> Iterator[tuple[str, Any]]:
+    """The topology: nodes in their own colours with their ids, rings for how they are, edges."""
+    at = positions(entities.ids, entities.spec.arcs)
+    labels = len(entities.ids) <= 4 * LEGEND
+    for (i, j), both_ways in entities.edges.items():
+        if both_ways:
+            yield entities.edge(i, j), rr.LineStrips2D([[at[i], at[j]]], radii=[EDGE], draw_order=0.0)
+        else:
+            source, target = (i, j) if (i, j) in entities.spec.arcs else (j, i)
+            a, b = np.array(at[source]), np.array(at[target])
+            along = (b - a) * (1 - RING / max(float(np.linalg.norm(b - a)), RING))  # the head stops at the ring
+            yield entities.edge(i, j), rr.Arrows2D(origins=[a], vectors=[along], radii=[EDGE], draw_order=0.0)
+    for i in entities.ids:
+        yield entities.ring(i), rr.Points2D([at[i]], radii=[RING], draw_order=1.0)
+        yield (
+            entities.point(i),
+            rr.Points2D(
+                [at[i]],
+                radii=[NODE],
+                colors=np.array([entities.colours[i]], dtype=np.uint32),
+                labels=[f"node {i}" if len(entities.ids) <= LEGEND else str(i)] if labels else None,
+                show_labels=labels,
+                draw_order=2.0,
+            ),
+        )
+
+
+def _overview(entities: Entities) -> rrb.Container:
+    errors = _plot(
+        "Estimation error: log10 ‖x̂ᵢ − x‖",
+        [entities.error(i) for i in entities.ids],
+        legend=len(entities.ids) <= LEGEND,
+    )
+    lanes = rrb.StateTimelineView(
+        origin="/alive", name="Processes", time_view=rrb.TimeAxis(link=rrb.components.LinkAxis.LinkToGlobal)
+    )
+    log = rrb.TextLogView(origin=EVENTS, name="Events")
+    return rrb.Horizontal(
+        rrb.Vertical(errors, lanes, row_shares=[3, 2]),
+        rrb.Vertical(_topology(entities), log, row_shares=[3, 2]),
+        column_shares=[5, 3],
+        name="Overview",
+    )
+
+
+def _topology(entities: Entities) -> rrb.View:
+    points = np.array(list(positions(entities.ids, entities.spec.arcs).values()))
+    low, high = points.min(axis=0) - 0.7, points.max(axis=0) + 0.7
+    return rrb.Spatial2DView(
+        origin="/mesh",
+        name="Topology (green up, amber late, red down)",
+        visual_bounds=rrb.VisualBounds2D(x_range=[low[0], high[0]], y_range=[low[1], high[1]]),
+    )
+
+
+def _estimates(entities: Entities) -> rrb.Container:
+    """One tab with all nodes, and one per node; a view per state."""
+    states = spread(entities.shown, VIEWS)
+    chosen = spread(entities.ids, LINES)
+
+    def grid(nodes: Iterable[int], name: str) -> rrb.Container:
+        views = []
+        for c in states:
+            paths = [f"{entities.state(c)}/actual", *(f"{entities.state(c)}/{entities.name(i)}" for i in nodes)]
+            views.append(_plot(f"x{c + 1}", paths, legend=len(paths) <= 6))
+        return rrb.Grid(*views, name=name)
+
+    return rrb.Tabs(
+        grid(chosen, "All nodes" if len(chosen) == len(entities.ids) else f"{len(chosen)} nodes"),
+        *(grid([i], f"Node {i}") for i in chosen if len(entities.ids) > 1),
+        active_tab=0,
+        name="Estimates",
+    )
+
+
+def _reconstruction(entities: Entities) -> list[rrb.Container]:
+    """What a method estimates beside the state, where it does."""
+    inputs = [
+        _plot(f"Unknown input w{j + 1}, estimated", [f"/unknown_input/w{j + 1}/**"], legend=len(entities.ids) <= LEGEND)
+        for j in range(entities.spec.unknown_inputs)
+    ]
+    noises = [
+        _plot(f"Measurement noise of node {i}, estimated", [f"/noise/{entities.name(i)}/**"], legend=True)
+        for i in spread(entities.ids, LINES)
+        if any(path.startswith("/noise") for _, path in entities.estimates(i))
+    ]
+    views = inputs[:VIEWS] + noises
+    return [rrb.Grid(*views, name="Reconstruction")] if views else []
+
+
+def _run(rates: bool) -> rrb.Container:
+    document = rrb.TextDocumentView(origin=DESCRIPTION, name="What was run")
+    if not rates:
+        return rrb.Horizontal(document, name="Run")
+    return rrb.Horizontal(_plot("Rates, per second", [f"{RATES}/**"], legend=True), document, name="Run")
+
+
+def _plot(name: str, contents: list[str], *, legend: bool) -> rrb.View:
+    return rrb.TimeSeriesView(
+        origin="/",
+        contents=contents,
+        name=name,
+        axis_x=rrb.TimeAxis(link=rrb.components.LinkAxis.LinkToGlobal),
+        plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.RightTop, visible=legend),
+        interaction=rrb.PlotInteraction(tooltip_mode=rrb.components.TooltipMode.All),
+    )
