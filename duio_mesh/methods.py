@@ -9,4 +9,7 @@ A method called ``name`` is three things that are found by that name:
 
 from __future__ import annotations
 
-METHODS: tuple[str, ...] = ("lmi",)
+METHODS: tuple[str, ...] = (
+    "lmi",
+    "reduced_order",
+)

@@ -1,0 +1,251 @@
+"""Reduced-order distributed unknown-input observer with unknown-input and noise reconstruction (seed 004).
+
+Continuous time, directed strongly connected graphs. Every node knows the same inputs; the others, and the plant's
+disturbances, are the unknown input f that every node reconstructs beside the state and its own measurement noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from pydantic import Field, PositiveFloat
+from scipy import linalg
+from scipy.sparse.csgraph import connected_components
+
+from duio_mesh.arrays import Array
+from duio_mesh.errors import DesignError
+from duio_mesh.geometry.subspace import norm
+from duio_mesh.scenario.model import Graph, Scenario
+from duio_mesh.spec import NodeSpec
+from duio_mesh.synthesis.design import Design, Progress, node_spec, plant_spec
+from duio_mesh.synthesis.reduced_order_local import (
+    WORST_CONDITION,
+    Interval,
+    Model,
+    Separated,
+    Split,
+    interval,
+    local_observer,
+    separate,
+    split,
+)
+from duio_mesh.synthesis.sampled import (
+    Coupled,
+    HoldOptions,
+    Local,
+    Step,
+    abscissa,
+    choose_gain,
+    error_system,
+    largest_step,
+    radius,
+    sampled,
+)
+
+
+class Options(HoldOptions):
+    """The keys under ``observer:`` for ``method: reduced_order``."""
+
+    c: PositiveFloat | Literal["auto"] = "auto"
+    """Coupling gain, 1/s. ``auto``: the smallest one whose sampled error decays about as fast as any."""
+    sigma: float = Field(default=0.5, ge=0)
+    """1/s. Invisible modes with Re >= -sigma are left to the network; 0 is the paper's literal split."""
+    rate: PositiveFloat = 3.0
+    """1/s. Visible modes are moved left of -rate."""
+    kappa: PositiveFloat = 5.0
+    """1/s. M = -kappa I of the interval observer; larger amplifies state errors in the unknown input."""
+    bounds: tuple[tuple[float, float], ...] | None = None
+    """[low, high] of each unknown input, default [-5, 5]. Only a scale: leaving them costs no accuracy."""
+    lipschitz: PositiveFloat = 50.0
+    """1/s^2. Bound on the second derivative of alpha. A step of f takes up to about kappa/lipschitz s."""
+
+
+class _Node(NamedTuple):
+    separated: Separated
+    gains: Split
+    bounds: Interval
+    local: Local
+
+    def coupled(self, c: float, step: Step | None) -> Coupled:
+        """Its part of the error system, continuous when ``step`` is None."""
+        s = self.separated
+        F, K = (self.local.A, self.local.K) if step is None else (step.Phi, step.K)
+        X = np.hstack([s.V2, np.zeros((s.V2.shape[0], s.W1.shape[0]))])
+        return Coupled(F, K, c * (s.V2 @ self.gains.Tu).T, X)
+
+
+def design(scenario: Scenario, progress: Progress) -> Design:
+    """Gains, conditions and node specs.
+
+    Raises DesignError, with numbers and node names, when the plant is not continuous, nodes know different inputs,
+    Assumption 1 or 2 fails, the graph does not connect the nodes that need help, the coupling cannot reach a direction
+    that no node sees (sufficient condition), or the coupling is unstable at this step.
+    """
+    options: Options = scenario.options
+    D, unknown = _unknown_input(scenario)
+    low, high = _bounds(options, D.shape[1])
+    plant, h, L = scenario.plant, scenario.plant.step, scenario.graph.laplacian()
+    nodes = {}
+    for i, node in scenario.nodes.items():
+        progress(f"node {i}: removing noise and unknown input")
+        s = separate(Model(plant.A, scenario.known(i), D, node.C, node.noise.channel), f"node {i}", unknown)
+        gains, bounds = split(s, options.sigma, options.rate, f"node {i}"), interval(s, low, high)
+        nodes[i] = _Node(s, gains, bounds, local_observer(s, gains, bounds, options.kappa))
+    _jointly_detectable(scenario, D, nodes, unknown)
+    bound, spread = _network(scenario.graph, L, nodes, options.sigma)
+    progress("choosing the coupling")
+    steps = {i: sampled(node.local, h, options) for i, node in nodes.items()}
+
+    def rho(c: float, at: float = h) -> float:
+        exact = steps if at == h else {i: sampled(node.local, at, options) for i, node in nodes.items()}
+        return radius(error_system([node.coupled(c, exact[i]) for i, node in nodes.items()], L))
+
+    c = choose_gain("c", options.c, rho, h, L)
+    certificate = {
+        "conditions": _conditions(nodes, spread),
+        "nodes": {i: _facts(node) for i, node in nodes.items()},
+        "spectral_abscissa": abscissa(error_system([node.coupled(c, None) for node in nodes.values()], L)),
+        "sampled_radius": rho(c),
+        "c": c,
+        "c_bound_13": bound,
+        "step": h,
+        "largest_step": largest_step(lambda at: rho(c, at), h),
+    }
+    specs = {i: _spec(scenario, i, node, steps[i], c) for i, node in nodes.items()}
+    return Design(scenario, plant_spec(scenario), specs, certificate)
+
+
+def _unknown_input(scenario: Scenario) -> tuple[Array, list[str]]:
+    """D (n, q) and its columns' names: what no node knows."""
+    plant = scenario.plant
+    if plant.time != "continuous":
+        raise DesignError("reduced_order needs a continuous plant (time: continuous, and step: under run)")
+    known = {i: frozenset(node.knows) for i, node in scenario.nodes.items()}
+    first = next(iter(known))
+    for i, names in known.items():
+        if names != known[first]:
+            raise DesignError(
+                f"reduced_order reconstructs one unknown input at every node, so all nodes must know the same inputs; "
+                f"node {first} knows {sorted(known[first])}, node {i} knows {sorted(names)}"
+            )
+    D = scenario.unknown(first)
+    unknown = [name for name in plant.inputs if name not in known[first]]
+    unknown += [f"disturbance {k + 1}" for k in range(plant.E.shape[1])]
+    seen = np.linalg.svd(D, compute_uv=False)
+    if D.shape[1] and (D.shape[1] > plant.n or seen[-1] <= 1e-9 * seen[0]):
+        raise DesignError(
+            f"the unknown inputs ({', '.join(unknown)}) do not enter independently: singular values of D are "
+            f"{np.array2string(seen, precision=3)}; combine dependent columns"
+        )
+    return D, unknown
+
+
+def _bounds(options: Options, q: int) -> tuple[Array, Array]:
+    bounds = options.bounds or ((-5.0, 5.0),) * q
+    if len(bounds) != q or any(low >= high for low, high in bounds):
+        raise DesignError(f"observer.bounds: one [low, high] with low < high for each of the {q} unknown inputs")
+    low, high = np.array(bounds).reshape(q, 2).T
+    return low, high
+
+
+def _jointly_detectable(scenario: Scenario, D: Array, nodes: Mapping[int, _Node], unknown: list[str]) -> None:
+    """Assumption 1: all nodes' noise-free measurements together leave no unstable invariant zero."""
+    plant = scenario.plant
+    W = [np.vstack([s.separated.W1, s.separated.W2]) @ scenario.nodes[i].C for i, s in nodes.items()]
+    C = np.vstack(W)
+    together = Model(plant.A, plant.B, D, C, np.zeros((C.shape[0], 0)))
+    left = split(separate(together, "all nodes together", unknown), 0.0, 1e-3, "all nodes together").undetectable
+    if left.size:
+        raise DesignError(
+            f"Assumption 1 fails: with the unknown inputs acting, all measurements together do not show the modes at "
+            f"{np.array2string(left, precision=4)} (Re >= 0), where rank [sI - A, D; C~, 0] < n + q"
+        )
+
+
+def _network(graph: Graph, L: Array, nodes: Mapping[int, _Node], sigma: float) -> tuple[float | None, float | None]:
+    """The paper's bound (13) on c, and the least eigenvalue of Y'(L^ kron I)Y; None when no node needs help.
+
+    The paper's Lemma 7 takes that eigenvalue to be positive under Assumption 1, which is wrong: directions that no node
+    estimates alone may be common to all nodes, and then no coupling gain helps.
+    """
+    helped = [i for i, node in nodes.items() if node.gains.Tu.shape[1]]
+    if not helped:
+        return None, None
+    count, labels = connected_components(L != 0, directed=True, connection="strong")
+    if count > 1:
+        groups = [[i for i, at in zip(graph.ids, labels, strict=True) if at == g] for g in range(count)]
+        raise DesignError(
+            f"the graph is not strongly connected: its strong components are {groups}, and nodes {helped} need the "
+            "estimates of others to follow the whole state"
+        )
+    r = np.abs(linalg.null_space(L.T, rcond=1e-10)[:, 0])
+    r /= r.max()
+    n = next(iter(nodes.values())).separated.V2.shape[0]
+    Lhat = np.diag(r) @ L + L.T @ np.diag(r)
+    Y = linalg.block_diag(*(node.separated.V2 @ node.gains.Tu for node in nodes.values()))
+    RA = linalg.block_diag(*(w * node.gains.Au for w, node in zip(r, nodes.values(), strict=True)))
+    values, vectors = np.linalg.eigh(Y.T @ np.kron(Lhat, np.eye(n)) @ Y)
+    spread = float(values[0])
+    if spread <= 1e-9 * norm(Lhat):
+        common = int(np.sum(values <= 1e-9 * norm(Lhat)))
+        direction = (Y @ vectors[:, 0])[:n]
+        raise DesignError(
+            f"{common} direction(s) of the state are left to the network by every node, so no coupling can reach them: "
+            f"the least eigenvalue of Y'(L^ kron I)Y is {spread:.2g} (must be positive), direction "
+            f"{np.array2string(direction / np.linalg.norm(direction), precision=3)}. A node leaves its invisible modes "
+            f"with Re >= {-sigma:g} to the network; a smaller observer.sigma or one more measurement may help"
+        )
+    return float(np.linalg.eigvalsh(RA + RA.T)[-1]) / spread, spread
+
+
+def _conditions(nodes: Mapping[int, _Node], spread: float | None) -> dict[str, dict[str, Any]]:
+    weakest = min(node.separated.margin for node in nodes.values())
+    found: dict[str, dict[str, Any]] = {
+        "assumption_1": {"value": 0, "threshold": "0 modes with Re >= 0 hidden from all nodes together", "ok": True},
+        "assumption_2": {"value": weakest, "threshold": f"> {1 / WORST_CONDITION:g}", "ok": True},
+    }
+    if spread is not None:
+        found["network"] = {"value": spread, "threshold": "> 0: least eigenvalue of Y'(L^ kron I)Y", "ok": True}
+    return found
+
+
+def _facts(node: _Node) -> dict[str, Any]:
+    s, gains = node.separated, node.gains
+    return {
+        "unknown_input_margin": s.margin,
+        "left_to_network": int(gains.Tu.shape[1]),
+        "left_to_network_modes": [[v.real, v.imag] for v in gains.undetectable],
+        "own_abscissa": float(gains.own.real.max()) if gains.own.size else None,
+        "gain_norm": norm(gains.N),
+        "state_error_in_unknown_input": node.bounds.amplification,
+    }
+
+
+def _spec(scenario: Scenario, i: int, node: _Node, step: Step, c: float) -> NodeSpec:
+    """Everything that a tick needs, combined: state s = [z2-hat; eta+], output [x-hat; alpha; v-hat] = Os s + Oy y."""
+    options: Options = scenario.options
+    s, bounds, sensor = node.separated, node.bounds, scenario.nodes[i]
+    q, k = s.W1.shape[0], s.A22.shape[0]
+    width = bounds.width / options.kappa  # delta of (16), which starts at its equilibrium and stays there
+    to_x = np.hstack([s.V2, np.zeros((s.V2.shape[0], q))]), s.U1 @ np.linalg.solve(s.C11, s.W1)
+    to_alpha = np.hstack([np.zeros((q, k)), np.diag(1 / width)]), -s.W1 / width[:, None]
+    Fplus = np.linalg.pinv(sensor.noise.channel)
+    to_v = -Fplus @ sensor.C @ to_x[0], Fplus - Fplus @ sensor.C @ to_x[1]
+    inverse = np.linalg.inv(bounds.G)
+    l0, l1 = 1.5 * np.sqrt(options.lipschitz), 1.1 * options.lipschitz
+    matrices = {
+        "Phi": step.Phi,
+        "Gamma": step.Gamma,
+        "K": c * step.K @ (s.V2 @ node.gains.Tu).T,
+        "bias": step.bias,
+        "Os": np.vstack([to_x[0], to_alpha[0], to_v[0]]),
+        "Oy": np.vstack([to_x[1], to_alpha[1], to_v[1]]),
+        "f0": inverse @ bounds.p_plus,
+        "f_alpha": inverse * bounds.width,
+        "f_rate": inverse * width,
+        "W1": s.W1,
+        "middle": width / 2,
+    }
+    return node_spec(scenario, i, matrices, {"q": q, "h": scenario.plant.step, "l0": float(l0), "l1": l1})

@@ -1,0 +1,156 @@
+"""A continuous observer run on samples: exact propagation between ticks, and what sampling does to its stability.
+
+A node has only y(k), u(k) and, from its neighbours, the difference of estimates of one common tick. Between ticks it
+integrates its own linear part exactly (matrix exponential), with y and u interpolated through its own latest samples
+and the coupling frozen. The error then obeys a linear recursion whose spectral radius decides whether a step is short
+enough; bounds like h < 2 / (c lambda_max) are only estimates of that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Literal, NamedTuple, TypeAlias
+
+import numpy as np
+from scipy import linalg
+
+from duio_mesh.arrays import Array
+from duio_mesh.errors import DesignError
+from duio_mesh.scenario.strict import Strict
+
+Hold: TypeAlias = Literal["zero_order", "first_order", "quadratic"]
+
+# rows: v(k), v(k-1), v(k-2); columns: coefficients of 1, s, s^2 with s = 0 at tick k-1 and s = 1 at tick k
+_INTERPOLATION: dict[Hold, Array] = {
+    "zero_order": np.array([[0.0, 0, 0], [1, 0, 0], [0, 0, 0]]),
+    "first_order": np.array([[0.0, 1, 0], [1, -1, 0], [0, 0, 0]]),
+    "quadratic": np.array([[0.0, 0.5, 0.5], [1, 0, -1], [0, -0.5, 0.5]]),
+}
+
+
+_ENOUGH = 0.95  # of the best decay rate: more coupling than that costs robustness and gains nothing
+
+
+class HoldOptions(Strict):
+    """Options that every sampled continuous observer has."""
+
+    hold: Hold = "first_order"
+    """How y is interpolated between the node's own samples: error O(h), O(h^2) or O(h^3) for a smooth y."""
+    input_hold: Hold | None = None
+    """The same for the known inputs; default as ``hold``. ``zero_order`` is exact for inputs that are held per tick."""
+
+
+class Local(NamedTuple):
+    """One node between ticks: ds/dt = A s + Y y + U u + K push + bias."""
+
+    A: Array  # (k, k)
+    Y: Array  # (k, p)
+    U: Array  # (k, m)
+    K: Array  # (k, c)
+    bias: Array  # (k,)
+
+
+class Step(NamedTuple):
+    """s(k) = Phi s(k-1) + Gamma history + K push(k-1) + bias, history = [y(k); u(k); y(k-1); u(k-1); ...]."""
+
+    Phi: Array  # (k, k)
+    Gamma: Array  # (k, lags (p + m))
+    K: Array  # (k, c)
+    bias: Array  # (k,)
+
+
+def sampled(local: Local, h: float, options: HoldOptions) -> Step:
+    """``local`` over one tick of h seconds, exact for inputs that follow their hold (quadratic: three lags, else two).
+
+    The moments J_m = int_0^h exp(A (h - t)) (t/h)^m dt come from one block exponential (Van Loan).
+    """
+    A, Y, U, K, bias = local
+    k, p = Y.shape
+    inputs = np.hstack([Y, U, K, bias[:, None]])
+    c = inputs.shape[1]
+    chain = np.zeros((k + 3 * c, k + 3 * c))
+    chain[:k, :k], chain[:k, k : k + c] = A, inputs
+    chain[k : k + 2 * c, k + c :] = np.eye(2 * c) / h
+    flow = linalg.expm(chain * h)[:k]
+    moments = np.stack([flow[:, k : k + c], flow[:, k + c : k + 2 * c], 2 * flow[:, k + 2 * c :]])
+    hold_u = options.input_hold or options.hold
+    lags = 3 if "quadratic" in (options.hold, hold_u) else 2
+    of_y = np.tensordot(_INTERPOLATION[options.hold], moments[:, :, :p], 1)
+    of_u = np.tensordot(_INTERPOLATION[hold_u], moments[:, :, p : p + U.shape[1]], 1)
+    Gamma = np.hstack([block for lag in range(lags) for block in (of_y[lag], of_u[lag])])
+    return Step(flow[:, :k], Gamma, moments[0][:, p + U.shape[1] : -1], moments[0][:, -1])
+
+
+class Coupled(NamedTuple):
+    """What a node contributes to the error system: s' (or s+) = F s + K R d, x-hat = X s + ..., d = sum a_ij (...)."""
+
+    F: Array  # (k, k) A or Phi
+    K: Array  # (k, c)
+    R: Array  # (c, n) push = R d, gain included
+    X: Array  # (n, k)
+
+
+def error_system(nodes: Sequence[Coupled], laplacian: Array) -> Array:
+    """The stacked error matrix: blkdiag(F_i) - blkdiag(K_i R_i) (L kron I) blkdiag(X_i), in the order of ``nodes``."""
+    n = nodes[0].X.shape[0]
+    coupling = linalg.block_diag(*(node.K @ node.R for node in nodes))
+    X = linalg.block_diag(*(node.X for node in nodes))
+    return np.asarray(linalg.block_diag(*(node.F for node in nodes)) - coupling @ np.kron(laplacian, np.eye(n)) @ X)
+
+
+def radius(M: Array) -> float:
+    """Spectral radius; 0 for an empty matrix."""
+    return float(np.abs(np.linalg.eigvals(M)).max(initial=0.0))
+
+
+def abscissa(M: Array) -> float:
+    """Largest real part of an eigenvalue; -inf for an empty matrix."""
+    return float(np.linalg.eigvals(M).real.max(initial=-np.inf))
+
+
+def choose_gain(
+    name: str, wanted: float | Literal["auto"], radius_at: Callable[[float], float], h: float, laplacian: Array
+) -> float:
+    """The coupling gain called ``name``: as wanted, or the smallest whose error decays about as fast as with any.
+
+    ``radius_at(gain)`` is the spectral radius of the sampled error system. Raises DesignError with that number when the
+    wanted gain, or every gain tried, leaves it at 1 or more.
+    """
+    strongest = float(np.abs(np.linalg.eigvals(laplacian)).max(initial=0.0))
+    if not strongest:  # nobody listens to anybody
+        return 0.0 if wanted == "auto" else wanted
+    if wanted != "auto":
+        rho = radius_at(wanted)
+        if rho >= 1:
+            raise DesignError(
+                f"observer.{name} = {wanted:g} is unstable at run.step = {h:g} s: the spectral radius of the sampled "
+                f"error system is {rho:.4f} and must be below 1 (step x {name} x |lambda|max(L) is "
+                f"{h * wanted * strongest:.3g}; above 2 no step is stable). Use {name}: auto, or another {name} or step"
+            )
+        return wanted
+    grid = np.geomspace(1e-4, 1, 49) * 2 / (h * strongest)
+    rates = -np.log(np.maximum([radius_at(gain) for gain in grid], 1e-300)) / h
+    if rates.max() <= 0:
+        raise DesignError(
+            f"no {name} between {grid[0]:.3g} and {grid[-1]:.3g} makes the sampled error system stable at run.step = "
+            f"{h:g} s: its least spectral radius is {np.exp(-rates.max() * h):.6f}. Use a shorter step or more edges"
+        )
+    return float(grid[np.argmax(rates >= _ENOUGH * rates.max())])
+
+
+def largest_step(sampled_radius: Callable[[float], float], start: float, limit: float = 10.0) -> float:
+    """The step (s) at which ``sampled_radius`` first reaches 1, between ``start`` and ``limit``, to 1 %.
+
+    Returns 0 when ``start`` itself is unstable and ``limit`` when nothing up to it is.
+    """
+    low, high = start, start
+    while sampled_radius(high) < 1:
+        if high >= limit:
+            return limit
+        low, high = high, min(1.25 * high, limit)
+    if high == start:
+        return 0.0
+    while high > 1.01 * low:
+        middle = float(np.sqrt(low * high))
+        low, high = (middle, high) if sampled_radius(middle) < 1 else (low, middle)
+    return low
