@@ -145,7 +145,7 @@ def test_six_state_example_of_seed_000() -> None:
     assert 1e-3 < observability_decomposition(*pairs[2]).rank.kept < 2e-3
 
 
-@pytest.mark.parametrize(("side", "speed"), [(5, 0.6), (7, 0.05), (7, 0.3), (7, 0.6)])
+@pytest.mark.parametrize(("side", "speed"), [(5, 0.6), (7, 0.3)])
 def test_symmetric_heat_grid(side: int, speed: float) -> None:
     """A square room grid seen from two opposite corners: modes antisymmetric about a diagonal are unobservable.
 
