@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from duio_mesh.scenario.problems import Path, Place, Problems, did_you_mean
+from duio_mesh.scenario.problems import Path, Place, Problems, listed
 from duio_mesh.scenario.source import read_text
 from duio_mesh.scenario.validate import describe
 
@@ -36,11 +36,12 @@ def _target(document: dict[str, Any], parts: list[str], place: Place, problems: 
     holder: Any = document
     path: Path = ()
     for depth, part in enumerate(parts):
-        key = _key(holder, part, path, place, problems)
+        last = depth == len(parts) - 1
+        key = _key(holder, part, path, last, place, problems)
         if key is None:
             return None
         path = (*path, key)
-        if depth == len(parts) - 1:
+        if last:
             return holder, path
         if isinstance(holder, dict) and holder.get(key) is None:
             holder[key] = {}
@@ -49,7 +50,7 @@ def _target(document: dict[str, Any], parts: list[str], place: Place, problems: 
     return None
 
 
-def _key(holder: Any, part: str, path: Path, place: Place, problems: Problems) -> str | int | None:
+def _key(holder: Any, part: str, path: Path, last: bool, place: Place, problems: Problems) -> str | int | None:
     """``part`` as a key of this mapping or an index of this list."""
     if isinstance(holder, list):
         if part.isascii() and part.isdigit() and int(part) < len(holder):
@@ -60,9 +61,9 @@ def _key(holder: Any, part: str, path: Path, place: Place, problems: Problems) -
     elif isinstance(holder, dict):
         if path == ("nodes",):
             key = int(part) if part.isascii() and part.isdigit() else part
-            if key in holder:
+            if last or key in holder:
                 return key
-            problems.report(place, (*path, part), f"no such node{did_you_mean(part, holder)}")
+            problems.report(place, (*path, part), f"no such node; the nodes are {listed(holder, 'and')}")
         else:
             return part
     else:

@@ -106,7 +106,9 @@ def dotted(path: Path) -> str:
 
 def did_you_mean(wrong: object, known: Iterable[object]) -> str:
     """' (did you mean x?)' for the nearest known word, '' when nothing is near."""
-    near = difflib.get_close_matches(str(wrong), [str(k) for k in known], n=1, cutoff=0.6)
+    near = difflib.get_close_matches(
+        str(wrong), [str(k) for k in known], n=1, cutoff=0.65
+    )  # lim is near lmi, uniform is not near normal
     return f" (did you mean {near[0]}?)" if near else ""
 
 

@@ -110,11 +110,12 @@ class _Builder:
 
     def __init__(self, text: str, source: str, problems: Problems) -> None:
         self._text, self._source, self._problems = text, source, problems
+        self._anchored: set[int] = set()
 
     def value(self, node: MappingNode | SequenceNode | ScalarNode, path: Path, key: Place | None) -> Any:
         place = self._place(node)
-        empty = node.start_mark.index == node.end_mark.index
-        self._problems.locate(path, key if empty and key else place, key)
+        elsewhere = node.start_mark.index == node.end_mark.index or id(node) in self._anchored
+        self._problems.locate(path, key if elsewhere and key else place, key)
         if self._decorated(node, path, place):
             return None
         if len(path) > MAX_DEPTH:
@@ -132,12 +133,12 @@ class _Builder:
     def _decorated(self, node: Node, path: Path, place: Place) -> bool:
         """Anchors and tags come first in a node's text; nothing else can start with these characters."""
         first = self._text[node.start_mark.index : node.start_mark.index + 1]
-        if first == "&" or node.anchor:
-            self._problems.poison(
-                path,
-                place,
-                f"anchors (&{node.anchor}) and aliases (*{node.anchor}) are not allowed: write the value out",
-            )
+        if id(node) in self._anchored:  # an alias is its anchor's node again, and has no place of its own
+            around = self._problems.key_place(path[:-1] if isinstance(path[-1], int) else path)
+            self._problems.poison(path, around, f"aliases (*{node.anchor}) are not allowed: write the value out")
+        elif first == "&" or node.anchor:
+            self._anchored.add(id(node))
+            self._problems.poison(path, place, f"anchors (&{node.anchor}) are not allowed: write the value out")
         elif first == "!":
             self._problems.poison(path, place, f"tags ({node.tag}) are not allowed: write the plain value")
         else:
