@@ -159,7 +159,7 @@ def test_a_zero_that_all_nodes_share_violates_assumption_1():
 
 
 def test_lemma_7_is_not_enough():
-    """Every sensor a phasor unit with its own clock: Assumptions 1 and 2 hold, but all miss one common slow direction."""
+    """Every sensor a phasor unit with its own clock: Assumptions 1 and 2 hold, all miss one common slow direction."""
     pairs = [(30, 31), (31, 32), (32, 33), (33, 37), (34, 37), (35, 37), (36, 37), (37, 38)]
     arcs = sorted(model.Arc(i, j, 1.0) for a in range(1, 9) for i, j in [(a, a % 8 + 1), (a % 8 + 1, a)])
     graph = model.Graph(tuple(range(1, 9)), tuple(arcs), False)
