@@ -1,0 +1,181 @@
+"""Augmented-state distributed unknown-input observer (seed 001): existence, gains, certificate.
+
+Discrete time, any graph: weighted, directed, in several parts. The theory is in ``augmented_existence``, the stacked
+error recursion in ``augmented_error``, the designs in ``augmented_h2`` and ``augmented_channel``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from duio_mesh.arrays import Array
+from duio_mesh.errors import DesignError
+from duio_mesh.geometry import RTOL, Stability, detectability_decomposition, stable_radius
+from duio_mesh.scenario.model import Noise, Scenario
+from duio_mesh.spec import NodeSpec
+from duio_mesh.synthesis.augmented_error import (
+    ErrorSystem,
+    Gains,
+    Network,
+    Sensor,
+    Transient,
+    distance_to_instability,
+    spectral_radius,
+    transient,
+)
+from duio_mesh.synthesis.augmented_existence import View, check
+from duio_mesh.synthesis.augmented_gains import find_gains, given_H
+from duio_mesh.synthesis.augmented_options import BraschPearson, Options
+from duio_mesh.synthesis.design import Design, Progress, node_spec, plant_spec
+from duio_mesh.synthesis.uio import decouple_node
+
+__all__ = ["Options", "design"]
+
+
+class Figures(NamedTuple):
+    """What the gains do, computed from Phi (12) alone."""
+
+    radius: float
+    powers: Transient
+    distance: float
+    rms: Array  # (N,), infinite unless Phi is Schur
+
+
+def design(scenario: Scenario, progress: Progress) -> Design:
+    """Check Lemma 4 and Theorem 8 (iv), find gains, verify them on the whole error system.
+
+    Raises DesignError when the plant is not discrete, a condition fails (the message names nodes, eigenvalue and
+    direction), given matrices have the wrong shape, or the gains miss the wanted decay rate, spectrum or peak.
+    """
+    options: Options = scenario.options
+    if scenario.plant.time != "discrete":
+        raise DesignError("augmented needs a discrete plant (time: discrete); its observers are difference equations")
+    progress("existence conditions")
+    network, views, margins = _network(scenario, options)
+    stability = stable_radius(min(options.rate, 1 - 1e-9))
+    sources = check(scenario.graph, views, scenario.plant.A, stability)
+    gains = find_gains(scenario, network, options, progress)
+    progress("certificate")
+    figures = _figures(network, gains)
+    _refuse(figures, options)
+    certificate = {
+        "conditions": _conditions(margins, sources, figures.radius, options.rate),
+        "nodes": _nodes(scenario, views, margins, stability, gains, figures.rms),
+        "spectral_radius": figures.radius,
+        "peak": _plain(figures.powers.peak),
+        "steps_to_1e-3": figures.powers.steps,
+        "distance_to_instability": figures.distance,
+        "gains": options.name,
+        "delay": options.delay,
+    }
+    specs = {
+        i: _spec(scenario, i, network.A, sensor, own, options.delay)
+        for i, sensor, own in zip(scenario.nodes, network.sensors, gains, strict=True)
+    }
+    return Design(scenario, plant_spec(scenario), specs, certificate)
+
+
+def noise_covariance(noise: Noise) -> Array:
+    """(p, p): covariance of the white part (``normal`` terms) of v_i as it enters y_i."""
+    variances = [
+        sum(p["std"] ** 2 for term in s for kind, p in term.items() if kind == "normal") for s in noise.signals
+    ]
+    return np.asarray(noise.channel * np.array(variances, dtype=np.float64) @ noise.channel.T)
+
+
+def _network(scenario: Scenario, options: Options) -> tuple[Network, dict[int, View], dict[int, float]]:
+    """The decoupled sensors, what condition (iv) reads of them, and Lemma 4's scale-free margin of each node."""
+    sensors, views, margins = [], {}, {}
+    for i, node in scenario.nodes.items():
+        own = decouple_node(scenario, i)
+        H = given_H(options, i, node.C, own.basis)
+        if H is None:
+            H = -own.E
+        sensors.append(Sensor(node.C, np.eye(scenario.plant.n) - H @ node.C, H, noise_covariance(node.noise)))
+        views[i] = View(node.C, own.P, own.basis)  # condition (iv) is stated for H = D (C D)^+ whatever H is used
+        margins[i] = own.margins["decoupling_rank"]
+    return Network(scenario.plant.A, tuple(sensors), scenario.graph.laplacian(), options.delay), views, margins
+
+
+def _figures(network: Network, gains: Sequence[Gains]) -> Figures:
+    system = ErrorSystem(network, [len(g.S) for g in gains])
+    Theta = system.theta(gains)
+    Phi = system.matrix(Theta)
+    return Figures(spectral_radius(Phi), transient(Phi), distance_to_instability(Phi), system.predicted_rms(Theta))
+
+
+def _refuse(figures: Figures, options: Options) -> None:
+    """Raise DesignError when the computed Phi is not what was asked for."""
+    chosen = options.chosen()
+    if figures.radius >= options.rate and not options.accept_unstable:
+        raise DesignError(
+            f"gains: {options.name}: the spectral radius of the whole error system is {figures.radius:.4g}, needed is "
+            f"less than {options.rate:g}. accept_unstable: true runs such gains all the same."
+        )
+    if isinstance(chosen, BraschPearson):
+        if figures.radius > chosen.radius + chosen.tolerance:
+            raise DesignError(
+                f"gains: brasch_pearson: the poles were asked for on the circle of radius {chosen.radius:g}, the "
+                f"computed spectral radius is {figures.radius:.4g} (tolerance {chosen.tolerance:g}). Double precision "
+                "cannot place the poles of so large an error system through one channel, or it has fixed modes. Use "
+                "gains: h2."
+            )
+        if figures.powers.peak > chosen.peak:
+            raise DesignError(
+                f"gains: brasch_pearson: initial errors may grow by {figures.powers.peak:.3g} before they decay; "
+                f"accepted is peak: {chosen.peak:g}. Use gains: h2, or raise tries or peak."
+            )
+
+
+def _conditions(
+    margins: Mapping[int, float], sources: Sequence[Mapping[str, Any]], radius: float, rate: float
+) -> dict[str, dict[str, Any]]:
+    """What had to hold: margins are singular values relative to 1, so they are comparable between systems."""
+    worst = min(margins, key=lambda i: margins[i])
+    found = {f"Lemma 4 (node {worst})": {"value": margins[worst], "threshold": RTOL, "ok": True}}
+    for source in sources:
+        name = f"Theorem 8 (iv), nodes {', '.join(map(str, source['nodes']))}"
+        found[name] = {"value": min(source["kept"], 1.0), "threshold": RTOL, "ok": True}
+    found["Phi is Schur"] = {"value": radius, "threshold": rate, "ok": radius < rate}
+    return found
+
+
+def _nodes(
+    scenario: Scenario,
+    views: Mapping[int, View],
+    margins: Mapping[int, float],
+    stability: Stability,
+    gains: Sequence[Gains],
+    rms: Array,
+) -> dict[int, dict[str, Any]]:
+    """Per node; predicted_rms is the stationary RMS error per state under the white noise of the file."""
+    A, found = scenario.plant.A, {}
+    for i, own, predicted in zip(scenario.nodes, gains, rms, strict=True):
+        view = views[i]
+        found[i] = {
+            "decoupling_margin": margins[i],
+            "undetectable_alone": detectability_decomposition(view.C, view.P @ A, stability).nu,
+            "beta": len(own.S),
+            "norm_F": float(np.linalg.norm(own.F, 2)),
+            "norm_K": float(np.linalg.norm(own.K, 2)),
+            "largest_gain": float(np.abs(own.theta).max()),
+            "predicted_rms": _plain(float(predicted)),
+        }
+    return found
+
+
+def _plain(value: float) -> float | None:
+    """JSON has no infinity."""
+    return value if np.isfinite(value) else None
+
+
+def _spec(scenario: Scenario, i: int, A: Array, sensor: Sensor, gains: Gains, delay: int) -> NodeSpec:
+    """(9): N = P A - F C, L = F + N H, M = P B_i."""
+    C, P, H, _ = sensor
+    F, K, Q, R, S = gains
+    N = P @ A - F @ C
+    matrices = {"N": N, "M": P @ scenario.known(i), "L": F + N @ H, "H": H, "K": K, "Q": Q, "R": R, "S": S}
+    return node_spec(scenario, i, matrices, {"delay": delay})
