@@ -8,13 +8,14 @@ the estimate of x(k).
 from __future__ import annotations
 
 import time
+from math import isfinite
 
 import numpy as np
 
 from duio_mesh.errors import RunError
 from duio_mesh.journal import Journal
 from duio_mesh.mesh import Mesh
-from duio_mesh.mesh.lockstep import Lockstep
+from duio_mesh.mesh.lockstep import ONE_ROUND, Exchange, Line, Lockstep
 from duio_mesh.observers import make_observer
 from duio_mesh.process import Report, main
 from duio_mesh.spec import NodeSpec
@@ -28,33 +29,29 @@ def run(spec: NodeSpec, report: Report) -> None:
     observer = make_observer(spec)
     with Mesh(spec.wire, f"node-{i}", report.warn) as mesh:
         keys = mesh.keys
-        plant = mesh.hear(keys.plant(i), f"plant -> {i}", "plant", ready=("plant", i), ahead=spec.window)
-        heard = {
-            j: mesh.hear(keys.edge(j, i), f"edge {j} -> {i}", f"node-{j}", ready=(j, i)) for j in sorted(spec.hears)
-        }
+        plant = Line(mesh, keys.plant(i), f"plant -> {i}", "plant", ("plant", i), spec.window)
+        heard = {j: Line(mesh, keys.edge(j, i), f"edge {j} -> {i}", f"node-{j}", (j, i), ONE_ROUND) for j in spec.hears}
         told = mesh.speak([(keys.edge(i, j), f"edge {i} -> {j}", (i, j)) for j in spec.tells])
         credit = mesh.speak([(keys.credit(i), f"{i} -> plant", (i, "plant"))])
         trace = mesh.speak([(keys.trace(i), f"{i} -> recorder", None)], drop=True)
-        mesh.watch()
+        lockstep = Lockstep(mesh, spec.deadline)
+        exchange = Exchange(lockstep, told, heard)
+        mesh.watch(lockstep.noticed)
         mesh.meet()
         report("ready")
-        lockstep = Lockstep(mesh, spec.deadline)
         row = sum(part.size for part in observer.estimate())
+        zeros = np.zeros(spec.n)
         rounds, begin = 0, time.monotonic()
-        with Journal(spec.output, row, trace) as journal:
+        with lockstep, Journal(spec.output, row, trace) as journal:
             for k in range(spec.steps):
                 sample = lockstep.take(plant, k, 0, p + spec.m)
                 observer.sample(sample[:p], sample[p:])
                 for r in range(observer.rounds):
-                    out = observer.message(r)
-                    told.send(k, r, out)
-                    observer.exchange(r, {j: lockstep.take(source, k, r, out.size) for j, source in heard.items()})
+                    observer.exchange(r, exchange(k, r, observer.message(r)))
                     rounds += 1
                 estimate = observer.estimate()
-                if not np.isfinite(estimate.state).all():
-                    raise RunError(
-                        f"node-{i}: the estimate overflowed at step {k}; is the plant unstable and open loop?"
-                    )
+                if not isfinite(zeros.dot(estimate.state)):
+                    raise RunError(f"node-{i}: the estimate overflowed at step {k}; is the plant unstable?")
                 journal.add(estimate)
                 if (k + 1) % spec.credit == 0 or k + 1 == spec.steps:
                     credit.send(k + 1, 0, NO_VECTOR)
@@ -63,6 +60,7 @@ def run(spec: NodeSpec, report: Report) -> None:
             steps=spec.steps,
             rounds=rounds,
             seconds=time.monotonic() - begin,
+            cpu_seconds=time.process_time(),
             frames=told.frames,
             rejected=mesh.rejections(),
         )

@@ -80,7 +80,14 @@ def run(spec: PlantSpec, report: Report) -> None:
             journal.flush()
             credits.wait(spec.steps)
         frames = sum(outlet.frames for outlet in samples.values())
-        report("done", steps=spec.steps, seconds=time.monotonic() - begin, frames=frames, rejected=mesh.rejections())
+        report(
+            "done",
+            steps=spec.steps,
+            seconds=time.monotonic() - begin,
+            cpu_seconds=time.process_time(),
+            frames=frames,
+            rejected=mesh.rejections(),
+        )
 
 
 if __name__ == "__main__":

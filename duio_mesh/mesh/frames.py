@@ -2,12 +2,14 @@
 
 Any msgpack library reads a frame; this module writes and reads it by offsets, because the integers always take their
 five-byte form. A frame that is not byte for byte in that form, from that source and of that run is refused, and the
-checksum (crc32 of everything before it) makes a flipped bit a refusal, too. Nothing is ever unpickled.
+checksum (crc32 of all bytes before it, least significant byte first) makes a flipped bit a refusal, too. Nothing is
+ever unpickled.
 """
 
 from __future__ import annotations
 
 import struct
+from functools import lru_cache
 from math import isfinite
 from typing import NamedTuple
 from zlib import crc32
@@ -20,11 +22,14 @@ from duio_mesh.arrays import Array
 VERSION = 1
 LIMIT = 1 << 32  # steps and rounds are unsigned 32-bit on the wire
 
+FLOAT64 = np.dtype("<f8")
+RESIDUE = 0x2144DF1C  # crc32 of anything that ends with its own crc32, least significant byte first
+TAIL = 6  # bytes of the checksum element: bin8, its length, the checksum
+
 _STAMP = struct.Struct(">BIBI")  # uint32 k, uint32 r in msgpack's 0xce form
 _UINT32 = 0xCE
-_CHECK = struct.Struct(">HI")  # bin8 of four bytes: the checksum
-_BIN8_OF_4 = 0xC404
-_FLOAT64 = np.dtype("<f8")
+_BIN8_OF_4 = b"\xc4\x04"
+_CHECK = struct.Struct("<I")
 _LAYOUTS = 16  # frame lengths that a decoder remembers
 _BIN_HEADERS = ((0xC4, ">BB", 1 << 8), (0xC5, ">BH", 1 << 16), (0xC6, ">BI", 1 << 32))
 
@@ -50,6 +55,12 @@ def prefix(run: str, source: str) -> bytes:
     return b"\x97" + b"".join(msgpack.packb(field) for field in (VERSION, run, source))
 
 
+@lru_cache(maxsize=16)  # a node uses very few payload sizes, and all neighbours the same step and round
+def stamp(k: int, r: int, size: int) -> bytes:
+    """What stands between the prefix and a payload of ``size`` bytes: step, round, and the payload's header."""
+    return _STAMP.pack(_UINT32, k, _UINT32, r) + _bin_header(size)
+
+
 def _bin_header(size: int) -> bytes:
     for code, form, limit in _BIN_HEADERS:
         if size < limit:
@@ -62,15 +73,12 @@ class Encoder:
 
     def __init__(self, run: str, source: str) -> None:
         self._prefix = prefix(run, source)
-        self._headers: dict[int, bytes] = {}
 
     def __call__(self, k: int, r: int, vector: Array) -> bytes:
-        """The frame of step k, round r."""
-        payload = vector.tobytes() if vector.dtype.str == "<f8" else vector.astype("<f8").tobytes()
-        size = len(payload)
-        header = self._headers.get(size) or self._headers.setdefault(size, _bin_header(size))
-        body = self._prefix + _STAMP.pack(_UINT32, k, _UINT32, r) + header + payload
-        return body + _CHECK.pack(_BIN8_OF_4, crc32(body))
+        """The frame of step k, round r; ``vector`` is float64 in C order (a block of rows goes row by row)."""
+        payload = vector.astype(FLOAT64, copy=False).tobytes()
+        body = self._prefix + stamp(k, r, len(payload)) + payload + _BIN8_OF_4
+        return body + _CHECK.pack(crc32(body))
 
 
 class Decoder:
@@ -90,21 +98,21 @@ class Decoder:
         front, k_form, k, r_form, r, header = layout.head.unpack_from(data)
         if front != self._prefix:
             raise Rejected("not from the expected source, run and version")
-        mark, check = _CHECK.unpack_from(data, layout.end)
-        if mark != _BIN8_OF_4 or check != crc32(memoryview(data)[: layout.end]):
+        if crc32(data) != RESIDUE:
             raise Rejected("checksum")
-        if k_form != _UINT32 or r_form != _UINT32 or header != layout.header:
+        end = layout.start + 8 * layout.count
+        if k_form != _UINT32 or r_form != _UINT32 or header != layout.header or data[end : end + 2] != _BIN8_OF_4:
             raise Rejected("layout")
         if not all(map(isfinite, layout.payload.unpack_from(data, layout.start))):
             raise Rejected("not finite")
-        return Frame(k, r, np.frombuffer(data, _FLOAT64, layout.count, layout.start))
+        return Frame(k, r, np.frombuffer(data, FLOAT64, layout.count, layout.start))
 
     def _learn(self, data: bytes) -> _Layout:
         """The layout of frames of this length; a length that no payload gives is refused."""
         if not data.startswith(self._prefix):
             raise Rejected("not from the expected source, run and version")
         head = len(self._prefix) + _STAMP.size
-        rest = len(data) - head - _CHECK.size
+        rest = len(data) - head - TAIL
         for code, form, limit in _BIN_HEADERS:
             size = rest - struct.calcsize(form)
             if 0 <= size < limit and size % 8 == 0 and _bin_header(size)[0] == code:
@@ -118,7 +126,6 @@ class Decoder:
             start=head + len(header),
             count=size // 8,
             payload=struct.Struct(f"<{size // 8}d"),
-            end=head + len(header) + size,
         )
         if len(self._layouts) < _LAYOUTS:  # who sends frames of every length shall not fill our memory
             self._layouts[len(data)] = layout
@@ -133,4 +140,3 @@ class _Layout(NamedTuple):
     start: int  # of the payload
     count: int  # of its numbers
     payload: struct.Struct
-    end: int  # of the payload; the checksum follows

@@ -1,59 +1,154 @@
 """Exactly (k, r) from exactly this neighbour, or a clear end.
 
-A neighbour can be at most one round ahead of a node, because its next round needs that node's present one. So two
-waiting frames per edge are all that can be right, and whatever does not fit into that is refused.
+The hot path of a node. Each incoming link has a channel that Zenoh fills without Python, so a round costs one wake-up
+per neighbour. A link delivers in order, so the next frame is nearly always the one that is due, and then comparing its
+first bytes with the expected ones replaces reading them. A wait has no timeout of its own: a watchdog closes the
+channel of a neighbour that has gone, or that let the deadline pass, and that ends the wait.
 """
 
 from __future__ import annotations
 
-from queue import Empty
+import threading
+import time
+from collections.abc import Mapping
+from math import isfinite
+from types import TracebackType
+from typing import Self
+from zlib import crc32
+
+import numpy as np
+import zenoh
 
 from duio_mesh.arrays import Array
 from duio_mesh.errors import RunError
-from duio_mesh.mesh.frames import Frame
-from duio_mesh.mesh.session import Mesh, Source
+from duio_mesh.mesh.frames import FLOAT64, RESIDUE, TAIL, Decoder, Rejected, prefix, stamp
+from duio_mesh.mesh.session import Mesh, Outlet, Ready, Source
+
+TICK = 0.1  # seconds between the watchdog's looks
+ONE_ROUND = 2  # frames: a neighbour can be one round ahead, because its next round needs our present one
+
+
+class Line(Source):
+    """One incoming link of a node."""
+
+    def __init__(self, mesh: Mesh, key: str, name: str, who: str, ready: Ready, capacity: int) -> None:
+        """``capacity``: frames that may wait in the channel; beyond it the sender feels it."""
+        super().__init__(name, who, Decoder(mesh.keys.run, who))
+        self.prefix = prefix(mesh.keys.run, who)
+        self.waiting: dict[tuple[int, int], Array] = {}  # good frames that are not due yet
+        self.capacity = capacity
+        self._subscriber = mesh.subscribe(key, zenoh.handlers.FifoChannel(capacity), ready)
+        self.receive = self._subscriber.handler.recv
+        mesh.sources.append(self)
+
+    def close(self) -> None:
+        """End the wait of ``receive``, once it has returned everything that had come."""
+        self._subscriber.undeclare()
 
 
 class Lockstep:
-    """Takes frames in order from the sources of one mesh."""
+    """Takes frames in order; a context manager around the time in which it may wait."""
 
     def __init__(self, mesh: Mesh, deadline: float) -> None:
         """``deadline``: seconds that any one wait may last."""
         self._mesh, self._deadline = mesh, deadline
+        self._at: tuple[Line, int, int] | None = None  # what the main thread waits for
+        self._news, self._over = threading.Event(), False
+        self._watchdog = threading.Thread(target=self._watch, name="watchdog", daemon=True)
+        self._zeros: dict[int, Array] = {}
 
-    def take(self, source: Source, k: int, r: int, size: int) -> Array:
-        """The vector (size,) of step k, round r from this source, waiting for it if need be.
+    def __enter__(self) -> Self:
+        self._watchdog.start()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+        self._over = True
+        self._news.set()
+        self._watchdog.join()
+
+    def take(self, line: Line, k: int, r: int, size: int) -> Array:
+        """The vector (size,) of step k, round r from this line, waiting for it if need be.
 
         Raises RunError naming edge, step and round when it does not come before the deadline, or when the other side
         has gone.
         """
+        expected = line.prefix + stamp(k, r, 8 * size)
+        zeros = self._zeros.get(size)
+        if zeros is None:
+            zeros = self._zeros[size] = np.zeros(size)
+        self._at = (line, k, r)
         while True:
-            vector = source.waiting.pop((k, r), None)
-            if vector is None:
-                self._more(source, k, r)
-            elif vector.size != size:
-                self._mesh.reject(source, f"{vector.size} numbers instead of {size}")
-            else:
-                source.taken = (k, r)
-                return vector
+            if line.waiting and (held := self._held(line, k, r, size)) is not None:
+                return held
+            try:
+                data: bytes = line.receive().payload.to_bytes()
+            except zenoh.ZError:  # the watchdog has closed the channel, and it is empty
+                raise RunError(self._why(line, k, r)) from None
+            start = len(expected)
+            if data.startswith(expected) and len(data) == start + 8 * size + TAIL and crc32(data) == RESIDUE:
+                vector = np.frombuffer(data, FLOAT64, size, start)
+                if isfinite(zeros.dot(vector)):  # 0 times a number that is not finite is not a number
+                    line.last = (k, r)
+                    self._at = None
+                    return vector
+            self._set_aside(line, data, k, r)
 
-    def _more(self, source: Source, k: int, r: int) -> None:
-        if source.gone and not self._mesh.pending():
-            raise RunError(f"{self._mesh.who} lost {source.who} while waiting on {source.name} for step {k}, round {r}")
+    def _held(self, line: Line, k: int, r: int, size: int) -> Array | None:
+        """The frame of step k, round r, if it came before it was due and has the right size."""
+        vector = line.waiting.pop((k, r), None)
+        if vector is not None and vector.size != size:
+            self._mesh.reject(line, f"{vector.size} numbers instead of {size}")
+            return None
+        return vector
+
+    def _set_aside(self, line: Line, data: bytes, k: int, r: int) -> None:
+        """A frame that is not simply the next one: keep it for later, or count it and drop it."""
         try:
-            got = self._mesh.get(self._deadline)
-        except Empty:
-            waited = f"{self._mesh.who} waited {self._deadline:g} s on {source.name} for step {k}, round {r}"
-            raise RunError(f"{waited}: {source.doing()}") from None
-        if got:
-            self._keep(*got)
-
-    def _keep(self, source: Source, frame: Frame) -> None:
-        k, r, vector = frame
-        step, turn = source.taken
-        if (k, r) <= (step, turn) or (k, r) in source.waiting:
-            self._mesh.reject(source, "seen before")
-        elif k - step > source.ahead or r - (turn if k == step else -1) > 2:
-            self._mesh.reject(source, "too far ahead")
+            frame = line.decode(data)
+        except Rejected as e:
+            self._mesh.reject(line, e.cause)
+            return
+        if frame[:2] < (k, r) or frame[:2] in line.waiting:
+            self._mesh.reject(line, "seen before")
+        elif frame.k - k > line.capacity or (frame.k == k and frame.r - r > 1) or (frame.k > k and frame.r > 1):
+            self._mesh.reject(line, "too far ahead")
         else:
-            source.waiting[k, r] = vector
+            line.waiting[frame[:2]] = frame.vector
+
+    def _why(self, line: Line, k: int, r: int) -> str:
+        if line.gone:
+            return f"{self._mesh.who} lost {line.who} while waiting on {line.name} for step {k}, round {r}"
+        return f"{self._mesh.who} waited {self._deadline:g} s on {line.name} for step {k}, round {r}: {line.doing()}"
+
+    def noticed(self, who: str, alive: bool) -> None:
+        """A directly linked process came or went (``Mesh.watch``)."""
+        if not alive:
+            for source in self._mesh.sources:
+                source.gone = source.gone or source.who == who
+            self._news.set()
+
+    def _watch(self) -> None:
+        """End a wait that cannot end well."""
+        seen, since = None, time.monotonic()
+        while not self._over:
+            self._news.wait(TICK)
+            self._news.clear()
+            at, now = self._at, time.monotonic()
+            if at is not seen:
+                seen, since = at, now
+            if at and (at[0].gone or now - since > self._deadline):
+                at[0].close()
+
+
+class Exchange:
+    """One node's rounds with its neighbours."""
+
+    def __init__(self, lockstep: Lockstep, told: Outlet, heard: Mapping[int, Line]) -> None:
+        self._take, self._send = lockstep.take, told.send
+        self._heard = sorted(heard.items())
+
+    def __call__(self, k: int, r: int, vector: Array) -> dict[int, Array]:
+        """Send our vector of step k, round r; every neighbour's vector of the same round, in ascending order of id."""
+        self._send(k, r, vector)
+        take, size = self._take, vector.size
+        return {j: take(line, k, r, size) for j, line in self._heard}

@@ -1,15 +1,14 @@
 """One Zenoh peer per process: links only where the graph has edges, and waits that always end.
 
-Receiving: a callback on Zenoh's own thread puts the raw bytes into one queue per process; everything else happens on
-the main thread, in ``Mesh.get``. A peer that disappears is put into the same queue, behind everything it had sent.
+Two ways to receive. What comes now and then from many (credits, traces) goes through one queue to ``Mesh.get``; a peer
+that disappears is put into the same queue, behind everything it had sent. The exchange of a node with its neighbours,
+which is the hot path, waits on one channel per neighbour instead: see lockstep.py.
 """
 
 from __future__ import annotations
 
-import ctypes
 import json
 import os
-import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable
@@ -32,7 +31,6 @@ from duio_mesh.mesh.keys import Keys
 from duio_mesh.spec import START, Wire
 
 Ready: TypeAlias = tuple[int | str, int | str]  # (source, target) of a link, for the start barrier
-ONE_ROUND = 2  # steps: a neighbour can be a round ahead of us, and we one behind what we last used
 
 
 def _config(wire: Wire) -> zenoh.Config:
@@ -58,16 +56,13 @@ def _config(wire: Wire) -> zenoh.Config:
 class Source:
     """One incoming key: who sends on it, what it has sent, and what of it was refused."""
 
-    def __init__(self, name: str, who: str, decode: Decoder, ahead: int) -> None:
+    def __init__(self, name: str, who: str, decode: Decoder) -> None:
         self.name = name  # as the user knows it: "edge 3 -> 2"
         self.who = who  # the process: "node-3"
         self.decode = decode
-        self.ahead = ahead
         self.last: tuple[int, int] | None = None  # (k, r) of the newest good frame
         self.rejected: Counter[str] = Counter()
         self.gone = False
-        self.taken = (-1, -1)  # newest (k, r) that was used: see lockstep.py
-        self.waiting: dict[tuple[int, int], Array] = {}  # good frames that are not due yet
 
     def doing(self) -> str:
         """What the other side last did, for messages to people."""
@@ -105,10 +100,9 @@ class Mesh:
         self.who, self.keys = who, Keys(wire.run)
         self._warn = warn
         self._queue: SimpleQueue[tuple[Source | str, bytes | None]] = SimpleQueue()
-        self._sources: list[Source] = []
+        self.sources: list[Source] = []
         self._meeting: dict[str, Any] = {}  # name of a link -> publisher that must match before the start
         self._kept: list[Any] = []
-        self._pinned: set[int] = set()
         try:
             self._session = zenoh.open(_config(wire))
         except zenoh.ZError as e:
@@ -125,23 +119,23 @@ class Mesh:
 
     # -- declaring --------------------------------------------------------------------------------------------------
 
-    def hear(self, key: str, name: str, who: str, ready: Ready | None = None, ahead: int = ONE_ROUND) -> Source:
-        """Subscribe to ``key``, on which the process ``who`` sends; ``ready`` names the link for the start barrier.
+    def hear(self, key: str, name: str, who: str, ready: Ready | None = None) -> Source:
+        """Let ``get`` return what the process ``who`` sends on ``key``; ``ready`` names the link for the start barrier.
 
-        ``ahead``: how many steps it may be ahead of the step last used (lockstep; the plant's window is larger).
+        For what comes now and then from many. The lockstep exchange of a node is in lockstep.py.
         """
-        source = Source(name, who, Decoder(self.keys.run, who), ahead)
-        self._sources.append(source)
-        put, pin = self._queue.put, self._pin
+        source = Source(name, who, Decoder(self.keys.run, who))
+        self.sources.append(source)
+        put = self._queue.put
+        self.subscribe(key, lambda sample: put((source, sample.payload.to_bytes())), ready)
+        return source
 
-        def arrived(sample: Any) -> None:
-            pin()
-            put((source, sample.payload.to_bytes()))
-
-        self._kept.append(self._session.declare_subscriber(key, zenoh.handlers.Callback(arrived, indirect=False)))
+    def subscribe(self, key: str, handler: Any, ready: Ready | None) -> Any:
+        """A Zenoh subscriber that lives as long as the mesh; ``ready`` announces it to the start barrier."""
+        self._kept.append(subscriber := self._session.declare_subscriber(key, handler))
         if ready:  # after the data subscriber, on the same link: whoever sees this one can be heard
             self._kept.append(self._session.declare_subscriber(self.keys.ready(*ready), lambda _: None))
-        return source
+        return subscriber
 
     def speak(self, links: Iterable[tuple[str, str, Ready | None]], drop: bool = False) -> Outlet:
         """Publish on every (key, name, ready) of ``links``; with ``drop`` a slow receiver costs frames, not time."""
@@ -154,7 +148,10 @@ class Mesh:
         return Outlet(Encoder(self.keys.run, self.who), publishers)
 
     def watch(self, changed: Callable[[str, bool], None] | None = None) -> None:
-        """Announce this process and notice when a directly linked one comes or goes (``changed(who, alive)``)."""
+        """Announce this process and notice when a directly linked one comes or goes (``changed(who, alive)``).
+
+        ``changed`` is called on a thread of Zenoh's and must return at once.
+        """
         self._kept.append(self._session.liveliness().declare_token(self.keys.alive(self.who)))
         put, start = self._queue.put, len(self.keys.alive(""))
 
@@ -167,16 +164,6 @@ class Mesh:
 
         everyone = self.keys.alive("*")
         self._kept.append(self._session.liveliness().declare_subscriber(everyone, seen, history=True))
-
-    def _pin(self) -> None:
-        """Keep this Zenoh thread's Python thread state: PyO3 otherwise makes and frees one for every message.
-
-        Worth a factor of two in rounds per second; the interpreter still exits cleanly because the session is closed.
-        """
-        ident = threading.get_ident()
-        if ident not in self._pinned:
-            self._pinned.add(ident)
-            ctypes.pythonapi.PyGILState_Ensure()
 
     # -- the start barrier ------------------------------------------------------------------------------------------
 
@@ -212,7 +199,7 @@ class Mesh:
         while True:
             source, data = self._queue.get(timeout=timeout)
             if isinstance(source, str):
-                for s in self._sources:
+                for s in self.sources:
                     s.gone = s.gone or s.who == source
                 return None
             try:
@@ -239,4 +226,4 @@ class Mesh:
 
     def rejections(self) -> dict[str, int]:
         """How many frames were refused, by cause."""
-        return dict(sum((s.rejected for s in self._sources), Counter()))
+        return dict(sum((s.rejected for s in self.sources), Counter()))
