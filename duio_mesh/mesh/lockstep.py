@@ -38,12 +38,15 @@ class Line(Source):
         self.waiting: dict[tuple[int, int], Array] = {}  # good frames that are not due yet
         self.capacity = capacity
         self._subscriber = mesh.subscribe(key, zenoh.handlers.FifoChannel(capacity), ready)
+        self._closed = False
         self.receive = self._subscriber.handler.recv
         mesh.sources.append(self)
 
     def close(self) -> None:
         """End the wait of ``receive``, once it has returned everything that had come."""
-        self._subscriber.undeclare()
+        if not self._closed:
+            self._closed = True
+            self._subscriber.undeclare()
 
 
 class Lockstep:
