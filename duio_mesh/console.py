@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 from rich.table import Table
 
 from duio_mesh import launcher
@@ -33,11 +33,9 @@ def working(on: str) -> Iterator[Callable[[str], None]]:
 def progress(design: Design) -> Iterator[launcher.Show]:
     """A bar with steps, steps per second, and every node's newest error."""
     columns = (
-        TextColumn("{task.description}"),
-        BarColumn(bar_width=24),
+        BarColumn(bar_width=12),
         MofNCompleteColumn(),
         TextColumn("{task.fields[rate]}"),
-        TimeRemainingColumn(),
         TextColumn("{task.fields[errors]}"),
     )
     with Progress(*columns, console=_err) as bar:
@@ -54,10 +52,10 @@ def progress(design: Design) -> Iterator[launcher.Show]:
 def errors_in_words(errors: Mapping[int, float]) -> str:
     """The newest error of every node, or of the best, the middle and the worst of many."""
     if len(errors) <= FEW:
-        return "  ".join(f"|e{i}| {e:.1e}" for i, e in sorted(errors.items()))
+        return " ".join(f"e{i} {e:.1e}" for i, e in sorted(errors.items()))
     ranked = sorted((e, i) for i, e in errors.items())
     chosen = (("best", ranked[0]), ("median", ranked[len(ranked) // 2]), ("worst", ranked[-1]))
-    return "  ".join(f"{name} |e{i}| {e:.1e}" for name, (e, i) in chosen)
+    return "  ".join(f"{name} e{i} {e:.1e}" for name, (e, i) in chosen)
 
 
 def hold(url: str) -> None:
@@ -99,28 +97,39 @@ def certificate(design: Design) -> None:
         mark = "[green]ok[/]" if condition["ok"] else "[red]no[/]"
         conditions.add_row(name, _text(condition["value"]), _text(condition["threshold"]), mark)
     _out.print(conditions)
-    nodes = found["nodes"]
-    columns = [key for key, value in next(iter(nodes.values())).items() if not isinstance(value, Mapping)]
-    table = Table("node", *columns, title="nodes")
-    for i, node in nodes.items():
-        table.add_row(str(i), *(_text(node.get(key)) for key in columns))
-    _out.print(table)
+    _out.print(_by_node(found["nodes"]))
     for name, value in found.items():
         if name not in ("conditions", "nodes"):
             _out.print(f"{name:24} {_text(value)}")
 
 
+def _by_node(nodes: Mapping[Any, Mapping[str, Any]]) -> Table:
+    """One row per quantity where the nodes are few, one row per node where they are many."""
+    quantities = [key for key, value in next(iter(nodes.values())).items() if not isinstance(value, Mapping)]
+    if len(nodes) > FEW:
+        table = Table("node", *quantities, title="nodes")
+        for i, node in nodes.items():
+            table.add_row(str(i), *(_text(node.get(key)) for key in quantities))
+        return table
+    table = Table("", *(f"node {i}" for i in nodes), title="nodes")
+    for key in quantities:
+        table.add_row(key, *(_text(node.get(key)) for node in nodes.values()))
+    return table
+
+
 def plan(design: Design, *, record: bool) -> None:
     """What a run would start, and who would talk to whom."""
-    table = Table("process", "command", "hears", "tells", title="would be started")
-    table.add_row("duio-plant", "python -m duio_mesh.plant --spec nodes/plant.spec", "", _text(list(design.nodes)))
+    _say("duio-plant", "plant", "plant", f"measures for {_text(list(design.nodes))}")
     for i, spec in design.nodes.items():
-        command = f"python -m duio_mesh.node --spec nodes/node-{i}.spec"
-        table.add_row(f"duio-node-{i}", command, _text(list(spec.hears)), _text(list(spec.tells)))
+        talks = f"hears {_text(list(spec.hears))}, tells {_text(list(spec.tells))}"
+        _say(f"duio-node-{i}", "node", f"node-{i}", talks)
     if record:
-        table.add_row("duio-recorder", "python -m duio_mesh.recorder --spec nodes/recorder.spec", "everybody", "")
-    _out.print(table)
+        _say("duio-recorder", "recorder", "recorder", "hears everybody")
     _out.print(f"{design.plant.steps} steps; links on loopback, along the edges, to the plant and to the recorder only")
+
+
+def _say(name: str, module: str, spec: str, talks: str) -> None:
+    _out.print(f"{name:14} python -m duio_mesh.{module} --spec nodes/{spec}.spec   {talks}", soft_wrap=True)
 
 
 def _number(value: float | None) -> str:

@@ -38,7 +38,7 @@ class Progress:
     """How far a run is."""
 
     steps: int  # finished by every node
-    errors: Mapping[int, float]  # node id -> 2-norm of its newest estimation error; empty before the first
+    errors: Mapping[int, float]  # node id -> RMS over the states of its newest error; empty before
 
 
 Show: TypeAlias = Callable[[Progress], None]
@@ -135,7 +135,7 @@ class Launch:
             x = _row(self._folder.rows("plant"), n, k - 1)
             estimate = _row(files[i], self._sizes[i], k - 1)
             if x is not None and estimate is not None:
-                errors[i] = float(np.linalg.norm(estimate[:n] - x))
+                errors[i] = float(np.sqrt(np.mean((estimate[:n] - x) ** 2)))
         show(Progress(min(steps.values()), errors))
         return sum(sizes.values())
 
@@ -167,7 +167,7 @@ def run(
     start-up time. Raises RunError when a process is lost or a deadline passes; the folder then holds what there is.
     """
     scenario = design.scenario
-    with supervisor or Supervisor() as supervisor:
+    with Supervisor() if supervisor is None else contextlib.nullcontext(supervisor) as supervisor:
         folder = RunFolder.create(scenario.name, out)
         write_inputs(folder, design)
         launch = Launch(design, folder, supervisor, record=record, live=live)
