@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import os
+import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import psutil
@@ -43,9 +44,9 @@ def _in_a_folder_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.chdir(tmp_path)
 
 
-def wait_for(condition: object, timeout: float = 20.0) -> None:
-    """Poll an outside condition (another process' file or state) until it is true."""
-    end = time.monotonic() + timeout
-    while not condition():  # type: ignore[operator]
+def wait_for(condition: Callable[[], object], timeout: float = 30.0) -> None:
+    """Until an outside condition (another process' file or state) is true; fails the test after ``timeout`` seconds."""
+    end, never = time.monotonic() + timeout, threading.Event()
+    while not condition():
         assert time.monotonic() < end, "waited in vain"
-        os.sched_yield()
+        never.wait(0.02)
