@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from duio_mesh.scenario.problems import Path, Place, Problems, listed
+from duio_mesh.scenario.problems import Path, Place, Problems, counted, listed
 from duio_mesh.scenario.source import read_text
 from duio_mesh.scenario.validate import describe
 
@@ -53,14 +53,14 @@ def _target(document: dict[str, Any], parts: list[str], place: Place, problems: 
 def _key(holder: Any, part: str, path: Path, last: bool, place: Place, problems: Problems) -> str | int | None:
     """``part`` as a key of this mapping or an index of this list."""
     if isinstance(holder, list):
-        if part.isascii() and part.isdigit() and int(part) < len(holder):
-            return int(part)
-        problems.report(
-            place, path, f"is a list of {len(holder)}: the index {part} is not one of its (they start at 0)"
-        )
+        index = _whole(part)
+        if index is not None and index < len(holder):
+            return index
+        problems.report(place, path, f"has {counted(len(holder), 'entry')}; there is no {part} (the first one is 0)")
     elif isinstance(holder, dict):
         if path == ("nodes",):
-            key = int(part) if part.isascii() and part.isdigit() else part
+            node = _whole(part)
+            key = part if node is None else node
             if last or key in holder:
                 return key
             problems.report(place, (*path, part), f"no such node; the nodes are {listed(holder, 'and')}")
@@ -69,3 +69,7 @@ def _key(holder: Any, part: str, path: Path, last: bool, place: Place, problems:
     else:
         problems.report(place, path, f"is {describe(holder)}; there is no {part} in it")
     return None
+
+
+def _whole(part: str) -> int | None:
+    return int(part) if part.isascii() and part.isdigit() and len(part) < 12 else None

@@ -96,12 +96,17 @@ class Problems:
             return
         files = list(dict.fromkeys(place.source for place, _ in self._found))
         ordered = sorted(self._found, key=lambda f: (files.index(f[0].source), f[0].line, f[0].column))
-        raise ScenarioError([f"{place}: {text}" for place, text in ordered])
+        raise ScenarioError([_one_line(f"{place}: {text}") for place, text in ordered])
 
 
 def dotted(path: Path) -> str:
     """nodes.1.C.0 for ('nodes', 1, 'C', 0)."""
     return ".".join(str(p) for p in path)
+
+
+def _one_line(text: str) -> str:
+    """Names and arguments come from the user: nothing in them may break a line or move the terminal's cursor."""
+    return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
 
 
 def did_you_mean(wrong: object, known: Iterable[object]) -> str:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any, ClassVar, Literal, TypeAlias
 
-from pydantic import Field, model_validator
+from pydantic import ConfigDict, Field, model_validator
 from pydantic_core import PydanticCustomError
 
 from duio_mesh.scenario.problems import listed
@@ -34,9 +34,15 @@ def _misfit(message: str, at: str | None = None) -> PydanticCustomError:
     return PydanticCustomError("misfit", "{message}", {"message": message, "at": at})
 
 
+def _alternatives(model: type[OneOf]) -> list[dict[str, list[str]]]:
+    """The same rule for editors."""
+    return [{"required": [name]} for name in getattr(model, "forms", ())]
+
+
 class OneOf(Strict):
     """A mapping of which exactly one of ``forms`` must be given."""
 
+    model_config = ConfigDict(json_schema_extra=lambda schema, model: schema.update(oneOf=_alternatives(model)))
     forms: ClassVar[tuple[str, ...]]
 
     @model_validator(mode="after")

@@ -32,7 +32,7 @@ def matrix(
     columns = width.number if width else len(rows[0]) if rows else 0
     wrong = [k for k, row in enumerate(rows) if len(row) != columns]
     why = width.why if width else "as the first row"
-    if wrong and width and len({len(row) for row in rows}) == 1:
+    if width and len(wrong) > 1 and len({len(row) for row in rows}) == 1:
         problems.at(path, f"should have {counted(columns, 'column')} ({why}), not {len(rows[0])}")
     else:
         for k in wrong:

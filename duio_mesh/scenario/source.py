@@ -166,13 +166,20 @@ class _Builder:
         if not isinstance(node, ScalarNode):
             self._problems.report(place, path, "a list or mapping cannot be a key")
             return None
-        key = node.value if node.style else plain(node.value)
+        if _UNPRINTABLE.search(node.value):
+            self._problems.report(place, path, "a key holds a control character")
+            return None
+        key = node.value if node.style else plain(node.value) if len(node.value) < 100 else node.value
         if isinstance(key, str) or (path == ("nodes",) and type(key) is int):
             return key
         self._problems.report(place, path, f"the key {node.value or 'null'} should be text; put it in quotes")
         return None
 
     def _scalar(self, node: ScalarNode, path: Path, place: Place) -> Any:
+        bad = _UNPRINTABLE.search(node.value)  # an escape in quotes, for the file itself has none
+        if bad:
+            self._problems.poison(path, place, f"holds the control character U+{ord(bad[0]):04X}")
+            return None
         if node.style:
             return node.value
         try:

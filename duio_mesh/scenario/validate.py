@@ -5,6 +5,7 @@ Values are handed over as JSON under strict rules: a list may become a tuple, bu
 
 from __future__ import annotations
 
+import functools
 import json
 import re
 from collections.abc import Mapping
@@ -62,12 +63,12 @@ class _Fault(NamedTuple):
 
 def _explain(error: ValidationError, model: type[BaseModel], value: Any, base: Path, problems: Problems) -> None:
     found = [_Fault(e["loc"], e["type"], e["msg"], e.get("ctx", {})) for e in error.errors(include_url=False)]
-    schema = TypeAdapter(model).json_schema()
     faults = _settle(found, value)
     suggested: set[Path] = set()  # missing keys that are there, misspelt
     for fault in faults:
         if fault.type == "extra_forbidden":
             *around, key = fault.loc
+            schema = _schema(model)
             known = _keys(schema, schema, tuple(around))
             near = did_you_mean(key, known)
             missing = next((k for k in known if near.endswith(f" {k}?)")), None)
@@ -83,6 +84,11 @@ def _explain(error: ValidationError, model: type[BaseModel], value: Any, base: P
             problems.at_key((*path, fault.context["at"]), fault.message)
         elif fault.type not in ("missing", "extra_forbidden"):
             problems.at(path, _words(fault, _reach(value, fault.loc)))
+
+
+@functools.cache
+def _schema(model: type[BaseModel]) -> dict[str, Any]:
+    return model.model_json_schema()
 
 
 def _reach(value: Any, path: Path) -> Any:

@@ -6,10 +6,10 @@ import re
 from pathlib import Path
 
 import pytest
-from broken import CASES, VALID, Case
-from stand_in import load
 
 from duio_mesh.errors import ScenarioError
+from tests.scenario.broken import CASES, VALID, Case
+from tests.scenario.stand_in import load
 
 LINE = re.compile(r"(?P<file>[^:]+):(?P<line>\d+):(?P<column>\d+): (?P<text>.+)")
 
