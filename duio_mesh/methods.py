@@ -11,6 +11,7 @@ from __future__ import annotations
 
 METHODS: tuple[str, ...] = (
     "augmented",
+    "geometric",
     "lmi",
     "reduced_order",
 )

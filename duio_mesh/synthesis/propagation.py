@@ -20,7 +20,7 @@ from duio_mesh.dynamics import SINUSOIDS, signal
 from duio_mesh.errors import DesignError
 from duio_mesh.scenario.model import Signal
 
-_MOST_PULSES = 50_000  # switches inside ticks in one run; more means a square wave far faster than the sampling
+_MOST_PULSES = 20_000  # switches inside ticks in one run; more means a square wave far faster than the sampling
 _NO_DRAW = np.random.default_rng(0)  # steps and squares draw nothing; the evaluator's signature asks for a stream
 
 
@@ -35,7 +35,7 @@ def propagators(A: Array, G: Array, drives: Sequence[Signal], step: float, steps
     - ``switch_ticks`` (S,) and ``switch_effects`` (S, n): the ticks inside which some drive switches, and what that
       adds to x at the end of the tick beyond holding the value from its beginning.
 
-    Raises DesignError when the drives switch inside ticks more than 50 000 times in the run.
+    Raises DesignError when the drives switch inside ticks more than 20 000 times in the run.
     """
     n, c = G.shape
     periods = sorted(

@@ -98,15 +98,18 @@ def design(scenario: Scenario, progress: Progress) -> Design:
     progress("choosing the coupling")
     steps = {i: sampled(node.local, h, options) for i, node in nodes.items()}
 
+    def growth(c: float) -> float:
+        return abscissa(error_system([node.coupled(c, None) for node in nodes.values()], L))
+
     def rho(c: float, at: float = h) -> float:
         exact = steps if at == h else {i: sampled(node.local, at, options) for i, node in nodes.items()}
         return radius(error_system([node.coupled(c, exact[i]) for i, node in nodes.items()], L))
 
-    c = choose_gain("c", options.c, rho, h, L)
+    c = choose_gain("c", options.c, growth, rho, h, L)
     certificate = {
         "conditions": _conditions(nodes, spread),
         "nodes": {i: _facts(node) for i, node in nodes.items()},
-        "spectral_abscissa": abscissa(error_system([node.coupled(c, None) for node in nodes.values()], L)),
+        "spectral_abscissa": growth(c),
         "sampled_radius": rho(c),
         "c": c,
         "c_bound_13": bound,

@@ -29,6 +29,7 @@ _INTERPOLATION: dict[Hold, Array] = {
 
 
 _ENOUGH = 0.95  # of the best decay rate: more coupling than that costs robustness and gains nothing
+_MARGIN = 1.5  # in the step
 
 
 class HoldOptions(Strict):
@@ -109,18 +110,30 @@ def abscissa(M: Array) -> float:
 
 
 def choose_gain(
-    name: str, wanted: float | Literal["auto"], radius_at: Callable[[float], float], h: float, laplacian: Array
+    name: str,
+    wanted: float | Literal["auto"],
+    abscissa_at: Callable[[float], float],
+    radius_at: Callable[[float, float], float],
+    h: float,
+    laplacian: Array,
 ) -> float:
     """The coupling gain called ``name``: as wanted, or the smallest whose error decays about as fast as with any.
 
-    ``radius_at(gain)`` is the spectral radius of the sampled error system. Raises DesignError with that number when the
-    wanted gain, or every gain tried, leaves it at 1 or more.
+    ``abscissa_at(gain)`` and ``radius_at(gain, step)`` belong to the error system in continuous time and sampled.
+    ``auto`` keeps a distance: its gain is stable at 1.5 times the step h too.
+    Raises DesignError with these numbers when the wanted gain, or every gain tried, is unstable.
     """
     strongest = float(np.abs(np.linalg.eigvals(laplacian)).max(initial=0.0))
     if not strongest:  # nobody listens to anybody
         return 0.0 if wanted == "auto" else wanted
     if wanted != "auto":
-        rho = radius_at(wanted)
+        growth = abscissa_at(wanted)
+        if growth >= 0:
+            raise DesignError(
+                f"observer.{name} = {wanted:g} is unstable at any step: the error system has an eigenvalue with real "
+                f"part {growth:.4g} (must be negative). Use {name}: auto, or more edges"
+            )
+        rho = radius_at(wanted, h)
         if rho >= 1:
             raise DesignError(
                 f"observer.{name} = {wanted:g} is unstable at run.step = {h:g} s: the spectral radius of the sampled "
@@ -129,12 +142,15 @@ def choose_gain(
             )
         return wanted
     grid = np.geomspace(1e-4, 1, 49) * 2 / (h * strongest)
-    rates = -np.log(np.maximum([radius_at(gain) for gain in grid], 1e-300)) / h
-    if rates.max() <= 0:
+    radii = np.array([max(radius_at(gain, h), 1e-300) for gain in grid])
+    safe = np.array([rho < 1 and radius_at(gain, _MARGIN * h) < 1 for gain, rho in zip(grid, radii, strict=True)])
+    if not safe.any():
         raise DesignError(
             f"no {name} between {grid[0]:.3g} and {grid[-1]:.3g} makes the sampled error system stable at run.step = "
-            f"{h:g} s: its least spectral radius is {np.exp(-rates.max() * h):.6f}. Use a shorter step or more edges"
+            f"{h:g} s and at {_MARGIN} times that: its least spectral radius is {radii.min():.6f}. Use a shorter step "
+            "or more edges"
         )
+    rates = np.where(safe, -np.log(radii), -np.inf)
     return float(grid[np.argmax(rates >= _ENOUGH * rates.max())])
 
 

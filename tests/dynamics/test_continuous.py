@@ -150,5 +150,5 @@ def test_a_discrete_plant_is_its_plain_recursion_bit_for_bit():
 
 
 def test_a_square_wave_far_faster_than_the_sampling_is_refused():
-    with pytest.raises(DesignError, match="switches inside a tick more than 50000 times"):
-        plant_spec(scenario(disturbance=((wave("square", 1.0, 3e-5),),)))
+    with pytest.raises(DesignError, match="switches inside a tick more than 20000 times"):
+        plant_spec(scenario(disturbance=((wave("square", 1.0, 5e-5),),)))
