@@ -14,7 +14,9 @@ from duio_mesh.report.topology import positions
 
 VIEWS = 12  # states that are shown side by side
 LINES = 16  # nodes whose lines share a view, and nodes with a tab of their own
-LEGEND = 16  # lines that a legend names
+LEGEND = 12  # lines that a legend names
+NAMED, WORDS = 64, 8  # nodes that are named in the topology view, and that are called more than their id
+LABEL = 0xE6EDF3FF
 NODE, RING, EDGE = 0.16, 0.23, 0.035  # radii in the topology view, where neighbours are about 1 apart
 
 
@@ -38,10 +40,13 @@ def styles(entities: Entities, description: str) -> Iterator[tuple[str, Any]]:
         yield path, _line("truth", TRUTH, 4.0)
     for i in entities.ids:
         yield entities.error(i), _line(f"node {i}", entities.colours[i], 1.5)
-        for column, path in entities.estimates(i):
+        for _, path in entities.estimates(i):
             own = path.startswith("/noise")
-            name = path.rsplit("/", 1)[1] if own else f"node {i}"
-            yield path, _line(name, entities.colours[i] if not own or column == 0 else None, 1.5)
+            single = not own or path.endswith("/v1")  # further noises of one node get the viewer's colours
+            yield (
+                path,
+                _line(path.rsplit("/", 1)[1] if own else f"node {i}", entities.colours[i] if single else None, 1.5),
+            )
     lanes = rr.StateConfiguration(values=list(STATES), colors=np.array(list(STATES.values()), dtype=np.uint32))
     for who in ("plant", *(f"node-{i}" for i in entities.ids)):
         yield entities.alive(who), lanes
@@ -75,7 +80,6 @@ def _line(name: str, colour: int | None, width: float) -> rr.SeriesLines:
 def _map(entities: Entities) -> Iterator[tuple[str, Any]]:
     """The topology: nodes in their own colours with their ids, rings for how they are, edges."""
     at = positions(entities.ids, entities.spec.arcs)
-    labels = len(entities.ids) <= 4 * LEGEND
     for (i, j), both_ways in entities.edges.items():
         if both_ways:
             yield entities.edge(i, j), rr.LineStrips2D([[at[i], at[j]]], radii=[EDGE], draw_order=0.0)
@@ -86,29 +90,24 @@ def _map(entities: Entities) -> Iterator[tuple[str, Any]]:
             yield entities.edge(i, j), rr.Arrows2D(origins=[a], vectors=[along], radii=[EDGE], draw_order=0.0)
     for i in entities.ids:
         yield entities.ring(i), rr.Points2D([at[i]], radii=[RING], draw_order=1.0)
-        yield (
-            entities.point(i),
-            rr.Points2D(
-                [at[i]],
-                radii=[NODE],
-                colors=np.array([entities.colours[i]], dtype=np.uint32),
-                labels=[f"node {i}" if len(entities.ids) <= LEGEND else str(i)] if labels else None,
-                show_labels=labels,
-                draw_order=2.0,
-            ),
-        )
+        colours = np.array([entities.colours[i]], dtype=np.uint32)
+        yield entities.point(i), rr.Points2D([at[i]], radii=[NODE], colors=colours, draw_order=2.0)
+    if len(at) <= NAMED:
+        below = [(x, y + RING) for x, y in at.values()]
+        names = [f"node {i}" if len(at) <= WORDS else str(i) for i in at]
+        white = np.full(len(at), LABEL, dtype=np.uint32)
+        yield "/mesh/names", rr.Points2D(below, radii=[0.001], colors=white, labels=names, show_labels=True)
 
 
 def _overview(entities: Entities) -> rrb.Container:
     errors = _plot(
-        "Estimation error: log10 ‖x̂ᵢ − x‖",
+        "Estimation error: log10 ‖x̂ − x‖",
         [entities.error(i) for i in entities.ids],
         legend=len(entities.ids) <= LEGEND,
     )
-    lanes = rrb.StateTimelineView(
-        origin="/alive", name="Processes", time_view=rrb.TimeAxis(link=rrb.components.LinkAxis.LinkToGlobal)
-    )
-    log = rrb.TextLogView(origin=EVENTS, name="Events")
+    lanes = rrb.StateTimelineView(origin="/alive", name="Processes", time_view=_whole_run())
+    columns = rrb.TextLogColumns(text_log_columns=["LogLevel", "Body"])
+    log = rrb.TextLogView(origin=EVENTS, name="Events", columns=columns)
     return rrb.Horizontal(
         rrb.Vertical(errors, lanes, row_shares=[3, 2]),
         rrb.Vertical(_topology(entities), log, row_shares=[3, 2]),
@@ -136,7 +135,7 @@ def _estimates(entities: Entities) -> rrb.Container:
         views = []
         for c in states:
             paths = [f"{entities.state(c)}/actual", *(f"{entities.state(c)}/{entities.name(i)}" for i in nodes)]
-            views.append(_plot(f"x{c + 1}", paths, legend=len(paths) <= 6))
+            views.append(_plot(f"x{c + 1}", paths, legend=c == states[0] and len(paths) <= LEGEND))
         return rrb.Grid(*views, name=name)
 
     return rrb.Tabs(
@@ -166,7 +165,10 @@ def _run(rates: bool) -> rrb.Container:
     document = rrb.TextDocumentView(origin=DESCRIPTION, name="What was run")
     if not rates:
         return rrb.Horizontal(document, name="Run")
-    return rrb.Horizontal(_plot("Rates, per second", [f"{RATES}/**"], legend=True), document, name="Run")
+    speed = [f"{RATES}/steps", f"{RATES}/rounds"]
+    rest = [f"{RATES}/**", *(f"- {path}" for path in speed)]
+    plots = (_plot("Steps and rounds per second", speed, legend=True), _plot("Frames per second", rest, legend=True))
+    return rrb.Horizontal(rrb.Vertical(*plots), document, name="Run")
 
 
 def _plot(name: str, contents: list[str], *, legend: bool) -> rrb.View:
@@ -174,7 +176,13 @@ def _plot(name: str, contents: list[str], *, legend: bool) -> rrb.View:
         origin="/",
         contents=contents,
         name=name,
-        axis_x=rrb.TimeAxis(link=rrb.components.LinkAxis.LinkToGlobal),
+        axis_x=_whole_run(),
         plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.RightTop, visible=legend),
         interaction=rrb.PlotInteraction(tooltip_mode=rrb.components.TooltipMode.All),
     )
+
+
+def _whole_run() -> rrb.TimeAxis:
+    """From the first to the last row. (Linked axes would start with the last minute before the cursor.)"""
+    ends = rr.TimeRangeBoundary.infinite()
+    return rrb.TimeAxis(view_range=rr.TimeRange(start=ends, end=ends))

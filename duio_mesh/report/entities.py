@@ -17,9 +17,8 @@ STATE_VALUES = 4_000_000  # values of states, estimates and reconstructions (abo
 SERIES = 640  # lines of states, estimates and reconstructions
 
 EVENTS, DESCRIPTION, RATES = "/events", "/description", "/rates"
-STATES = {"up": 0x3FB950FF, "late": 0xD29922FF, "down": 0xF85149FF, "done": 0x8B949EFF}
-"""How a process or an edge is, and its colour (RGBA): green, amber, red, grey."""
-WORST = ("done", "up", "late", "down")
+STATES = {"up": 0x3FB950FF, "unknown": 0x8B949EFF, "late": 0xD29922FF, "down": 0xF85149FF}
+"""How a process or an edge can be, the better before the worse, and its colour (RGBA): green, grey, amber, red."""
 TRUTH = 0x9AA0A6FF
 
 Column: TypeAlias = tuple[int, str]
@@ -108,10 +107,24 @@ class Entities:
         return 1 if rows <= ERROR_ROWS else -(-2 * rows // ERROR_ROWS)
 
     @cached_property
+    def error_rows(self) -> int:
+        """Error norms of all nodes that are kept of a whole run."""
+        return min(len(self.ids) * self.spec.steps, ERROR_ROWS)
+
+    @cached_property
+    def series(self) -> int:
+        """Lines of states, estimates and reconstructions."""
+        return len(self.truth) + sum(len(self.estimates(i)) for i in self.ids)
+
+    @cached_property
     def state_stride(self) -> int:
         """Every how many steps a row of states, estimates and reconstructions is kept; 1 keeps all."""
-        series = len(self.truth) + sum(len(self.estimates(i)) for i in self.ids)
-        return max(1, -(-series * self.spec.steps // STATE_VALUES))
+        return max(1, -(-self.series * self.spec.steps // STATE_VALUES))
+
+    @cached_property
+    def state_values(self) -> int:
+        """Values of states, estimates and reconstructions that are kept of a whole run."""
+        return self.series * (self.spec.steps // self.state_stride)
 
     def kept(self) -> str:
         """In words (markdown), what of the run this recording holds."""

@@ -1,0 +1,231 @@
+"""A run as a Rerun recording: live while it runs, complete when it has ended."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+
+from duio_mesh.arrays import Array
+from duio_mesh.report import blueprint as look
+from duio_mesh.report.buffer import ROWS, Buffer
+from duio_mesh.report.conditions import Conditions
+from duio_mesh.report.entities import EVENTS, RATES, Column, Entities
+from duio_mesh.report.pairing import Decimator, Errors, Pairing, Span, Spans, runs
+from duio_mesh.report.streams import Batch, FileStream, LiveStream, Opening
+from duio_mesh.spec import RecorderSpec
+
+SENDS = 100  # of one series in a whole run: a viewer is behind by one percent of the plot's width at most
+CHUNKS = 20_000  # sends of a whole run, all series: each costs 50 microseconds and 2 kB whatever is in it
+
+
+class Recording:
+    """recording.rrd and, where the spec says so, the same live.
+
+    Rows may arrive in any order, in batches of any size, twice, or never; ``missing`` says what never came and ``fill``
+    takes it from elsewhere. Nothing here waits for a viewer. Not for several threads.
+    """
+
+    def __init__(self, spec: RecorderSpec, *, rates: bool = True) -> None:
+        """Open the file (and the live server). ``rates``: whether there will be any.
+
+        Raises OSError when the file cannot be created or no port be had, ValueError when Rerun is turned off.
+        """
+        self._spec, self._entities = spec, Entities(spec)
+        entities = self._entities
+        description = f"{spec.description}\n\n---\n{entities.kept()}\n"
+        layout = look.blueprint(entities, rates=rates)
+        opening = Opening.of(spec.name, spec.step, layout, look.styles(entities, description))
+        self._file = FileStream(Path(spec.recording), opening)
+        self._live = LiveStream(opening) if spec.live else None
+        self._closed = False
+
+        self._pairing = Pairing(spec.n, entities.ids, spec.steps)
+        self._seen: dict[int | None, Spans] = {source: Spans() for source in (None, *entities.ids)}
+        self._thinned = {i: Decimator(entities.error_stride) for i in entities.ids}
+        self._columns: dict[int | None, tuple[Column, ...]] = {None: entities.truth}
+        self._columns |= {i: entities.estimates(i) for i in entities.ids}
+        paths = {source: [path for _, path in columns] for source, columns in self._columns.items()}
+        enough = _enough(entities.error_rows, len(entities.ids), CHUNKS // 4)
+        self._errors = {i: Buffer([entities.error(i)], enough, self._scalars) for i in entities.ids}
+        enough = _enough(entities.state_values, entities.series, CHUNKS * 3 // 4)
+        self._states = {source: Buffer(paths[source], enough, self._scalars) for source in paths}
+
+        self._conditions = Conditions(entities, self._send, self.event)
+
+    @property
+    def url(self) -> str | None:
+        """Where a viewer can watch (``rerun URL``), or None when the recording is not live."""
+        return self._live.url if self._live else None
+
+    @property
+    def dropped(self) -> int:
+        """Batches that the live server could not take because a viewer was too slow; the file has them."""
+        return self._live.dropped if self._live else 0
+
+    def truth(self, k: int, rows: Array) -> None:
+        """True states (m, n) of the steps k .. k+m-1. Raises ValueError for a wrong shape or step."""
+        self._check("the truth", k, rows, self._spec.n)
+        self._record(None, k, rows)
+        for errors in self._pairing.truth(k, rows):
+            self._say(errors)
+
+    def estimates(self, node: int, k: int, rows: Array) -> None:
+        """Rows (m, size) of a node for the steps k .. k+m-1: n states, then what else the method estimates.
+
+        Raises ValueError for a wrong shape or step, KeyError for an unknown node.
+        """
+        self._check(f"node {node}", k, rows, self._spec.sizes[node])
+        self._record(node, k, rows)
+        for first, last in self._pairing.known[node].gaps(k, k + len(rows)):
+            self._say(self._pairing.estimates(node, first, rows[first - k : last - k, : self._spec.n]))
+
+    def liveness(self, who: str | int, state: str, k: int) -> None:
+        """How a process (plant, node-3 or the node's id) is from step k on: up, late or down.
+
+        A process that goes after its last step has done its work and is not called down. Repeating a state is no news.
+        """
+        self._conditions.process(who if isinstance(who, str) else f"node-{who}", state, k)
+
+    def edge(self, i: int, j: int, state: str, k: int) -> None:
+        """How the arc on which i tells j is from step k on: up, late or down. Raises KeyError when there is none."""
+        self._conditions.arc(i, j, state, k)
+
+    def event(self, text: str, level: str = "INFO", k: int = 0) -> None:
+        """A line of the event log; ``level`` is one of TRACE, DEBUG, INFO, WARN, ERROR."""
+        self._send(EVENTS, [k], rr.TextLog.columns(text=[text], level=[level]))
+
+    def rates(self, k: int, values: Mapping[str, float]) -> None:
+        """Rates per second at step k, e.g. ``{"steps": 510.0, "frames": 4080.0}``; about once a second is enough."""
+        for name, value in values.items():
+            self._send(f"{RATES}/{name}", [k], rr.Scalars.columns(scalars=[float(value)]))
+
+    def flush(self) -> None:
+        """Send what has gathered, where it is enough to be worth it. Call it as often as a viewer should see news."""
+        for buffer in self._buffers():
+            buffer.flush()
+
+    def missing(self) -> dict[int | None, list[Span]]:
+        """Steps (first, last + 1) whose rows or errors are not in the recording, by node; None is the truth."""
+        steps = self._spec.steps
+        found = {None: self._seen[None].gaps(0, steps)} | {i: s.gaps(0, steps) for i, s in self._pairing.known.items()}
+        return {source: gaps for source, gaps in found.items() if gaps}
+
+    def fill(self, truth: Array, estimates: Mapping[int, Array]) -> None:
+        """Take what is missing from whole files: row k of each is step k. They may be short, or memory maps.
+
+        Rows that are NaN throughout were never written by anybody and stay missing.
+        """
+        window = self._pairing.window
+        wanted = {i: spans for i, spans in self.missing().items() if i is None or i in estimates}
+        for first, last in runs(_union(wanted.values(), window)):
+            for k in range(first * window, min(last * window, self._spec.steps), window):
+                self._give(None, k, truth[k : k + window])
+                for i, rows in estimates.items():
+                    for a, b in self._pairing.known[i].gaps(k, min(k + window, len(rows))):
+                        self._give(i, a, rows[a:b])
+
+    def close(self) -> None:
+        """Mark what is still missing, write everything and the footer. Raises OSError when the disk would not take it.
+
+        A viewer that is frozen is left behind after two seconds.
+        """
+        if self._closed:
+            return
+        self._closed = True
+        for i, decimator in self._thinned.items():
+            self._errors[i].add(*_column(*decimator.drain()))
+        for source, gaps in self.missing().items():
+            who = "the truth" if source is None else f"node {source}"
+            spans = ", ".join(f"{a} to {b - 1}" for a, b in gaps[:8]) + (", ..." if len(gaps) > 8 else "")
+            self.event(f"not in the recording: {who}, steps {spans}", "WARN", gaps[-1][1] - 1)
+        self._break_lines()
+        if self.dropped:
+            self.event(f"{self.dropped} batches were too much for a live viewer; this file has them", "INFO")
+        for buffer in self._buffers():
+            buffer.flush(everything=True)
+        try:
+            self._file.close()
+        finally:
+            if self._live:
+                self._live.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+        self.close()
+
+    def _check(self, who: str, k: int, rows: Array, size: int) -> None:
+        if rows.ndim != 2 or rows.shape[1] != size:
+            raise ValueError(f"{who}: rows of shape {rows.shape} instead of (m, {size})")
+        if k < 0 or k + len(rows) > self._spec.steps:
+            raise ValueError(f"{who}: steps {k} to {k + len(rows) - 1} of a run of {self._spec.steps}")
+
+    def _record(self, source: int | None, k: int, rows: Array) -> None:
+        """Keep the rows that are new."""
+        columns, stride, final = self._columns[source], self._entities.state_stride, self._spec.steps - 1
+        for first, last in self._seen[source].gaps(k, k + len(rows)):
+            steps = np.arange(first, last)
+            keep = (steps % stride == 0) | (steps == final)
+            self._states[source].add(steps[keep], rows[first - k : last - k][keep][:, [c for c, _ in columns]])
+        self._seen[source].add(k, k + len(rows))
+
+    def _say(self, errors: Errors) -> None:
+        steps, values = self._thinned[errors.node].push(errors.steps, errors.log10)
+        self._errors[errors.node].add(*_column(steps, values))
+
+    def _break_lines(self) -> None:
+        """A NaN at the start of every gap between two rows: a viewer would join the rows with a line."""
+        for i, known in self._pairing.known.items():
+            at = _inner_gaps(known)
+            self._errors[i].add(at, np.full((len(at), 1), np.nan))
+        for source, seen in self._seen.items():
+            at = _inner_gaps(seen)
+            self._states[source].add(at, np.full((len(at), len(self._columns[source])), np.nan))
+
+    def _give(self, source: int | None, k: int, rows: Array) -> None:
+        """Take the rows that somebody wrote."""
+        for first, last in runs(np.flatnonzero(~np.isnan(rows).all(axis=1))):
+            part = np.asarray(rows[first:last])
+            if source is None:
+                self.truth(k + first, part)
+            else:
+                self.estimates(source, k + first, part)
+
+    def _buffers(self) -> list[Buffer]:
+        return [*self._errors.values(), *self._states.values()]
+
+    def _scalars(self, path: str, steps: NDArray[np.int64], values: Array) -> None:
+        self._send(path, steps, rr.Scalars.columns(scalars=values))
+
+    def _send(self, path: str, steps: Sequence[int] | NDArray[np.int64], columns: Any) -> None:
+        batch = Batch(path, np.asarray(steps, dtype=np.int64), columns)
+        self._file.send(batch)
+        if self._live:
+            self._live.send(batch)
+
+
+def _enough(values: int, series: int, sends: int) -> int:
+    """Rows that one send of a series should hold: all series together are to take so many sends for their values."""
+    return min(ROWS, max(1, values // series // max(1, min(SENDS, sends // series))))
+
+
+def _column(steps: NDArray[np.int64], values: Array) -> tuple[NDArray[np.int64], Array]:
+    return steps, values[:, None]
+
+
+def _inner_gaps(spans: Spans) -> NDArray[np.int64]:
+    """The first step of every gap between two spans."""
+    return np.array([last for _, last in spans][:-1], dtype=np.int64)
+
+
+def _union(many: Any, window: int) -> NDArray[np.int64]:
+    """Ascending numbers of the stretches of ``window`` steps that these spans touch."""
+    touched = {at for spans in many for first, last in spans for at in range(first // window, (last - 1) // window + 1)}
+    return np.array(sorted(touched), dtype=np.int64)
