@@ -28,6 +28,7 @@ from duio_mesh.synthesis.sampled import (
     choose_gain,
     error_system,
     largest_step,
+    modes,
     radius,
     sampled,
 )
@@ -121,7 +122,7 @@ def _conditions(scenario: Scenario, nodes: Mapping[int, LocalUio]) -> dict[str, 
                 raise DesignError(
                     f"node {i} has no neighbours and cannot follow the state alone: W_g* and Ker C have "
                     f"{nodes[i].hidden} common direction(s) (Lemma 2 asks for 0). Its W* has dimension "
-                    f"{nodes[i].structure.W.shape[1]}, its bad zeros are {_list(nodes[i].structure.bad)}"
+                    f"{nodes[i].structure.W.shape[1]}, its bad zeros are {modes(nodes[i].structure.bad)}"
                 )
             continue
         common = np.eye(scenario.plant.n)
@@ -132,7 +133,7 @@ def _conditions(scenario: Scenario, nodes: Mapping[int, LocalUio]) -> dict[str, 
             sizes = {i: nodes[i].R.shape[0] for i in island}
             raise DesignError(
                 f"Assumption 3 fails for nodes {list(island)}: {common.shape[1]} direction(s) of the state are hidden "
-                f"from all of them, first {np.array2string(common[:, 0], precision=3)}. Dimensions of V_i (N1) and "
+                f"from all of them, first {np.round(common[:, 0], 4).tolist()}. Dimensions of V_i (N1) and "
                 f"W_g,i (N2): {sizes}. Connect islands, add a sensor or tell an input"
             )
         left[island] = 0
@@ -143,10 +144,6 @@ def _conditions(scenario: Scenario, nodes: Mapping[int, LocalUio]) -> dict[str, 
     if alone:
         found["lemma_2"] = {"value": alone, "threshold": "nodes that need no neighbours", "ok": True}
     return found
-
-
-def _list(values: Any) -> str:
-    return "[" + ", ".join(f"{v:.4g}" for v in values) + "]"
 
 
 def bounds_21(scenario: Scenario, nodes: Mapping[int, LocalUio]) -> dict[str, float | None]:
@@ -207,7 +204,7 @@ def _facts(node: LocalUio) -> dict[str, Any]:
         "dim_S": s.S.shape[1],
         "dim_V": s.V.shape[1],
         "dim_Wg": s.Wg.shape[1],
-        "zeros": [[float(z.real), float(z.imag)] for z in s.zeros],
+        "zeros": modes(s.zeros),
         "own_abscissa": float(node.own.real.max()) if node.own.size else None,
         "gain_norm": norm(node.L),
     }

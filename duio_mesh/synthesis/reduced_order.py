@@ -40,6 +40,7 @@ from duio_mesh.synthesis.sampled import (
     choose_gain,
     error_system,
     largest_step,
+    modes,
     radius,
     sampled,
 )
@@ -163,7 +164,7 @@ def _jointly_detectable(scenario: Scenario, D: Array, nodes: Mapping[int, _Node]
     if left.size:
         raise DesignError(
             f"Assumption 1 fails: with the unknown inputs acting, all measurements together do not show the modes at "
-            f"{np.array2string(left, precision=4)} (Re >= 0), where rank [sI - A, D; C~, 0] < n + q"
+            f"{modes(left)} (Re >= 0), where rank [sI - A, D; C~, 0] < n + q"
         )
 
 
@@ -197,7 +198,7 @@ def _network(graph: Graph, L: Array, nodes: Mapping[int, _Node], sigma: float) -
         raise DesignError(
             f"{common} direction(s) of the state are left to the network by every node, so no coupling can reach them: "
             f"the least eigenvalue of Y'(L^ kron I)Y is {spread:.2g} (must be positive), direction "
-            f"{np.array2string(direction / np.linalg.norm(direction), precision=3)}. A node leaves its invisible modes "
+            f"{np.round(direction / np.linalg.norm(direction), 4).tolist()}. A node leaves its invisible modes "
             f"with Re >= {-sigma:g} to the network; a smaller observer.sigma or one more measurement may help"
         )
     return float(np.linalg.eigvalsh(RA + RA.T)[-1]) / spread, spread
@@ -219,7 +220,7 @@ def _facts(node: _Node) -> dict[str, Any]:
     return {
         "unknown_input_margin": s.margin,
         "left_to_network": int(gains.Tu.shape[1]),
-        "left_to_network_modes": [[v.real, v.imag] for v in gains.undetectable],
+        "left_to_network_modes": modes(gains.undetectable),
         "own_abscissa": float(gains.own.real.max()) if gains.own.size else None,
         "gain_norm": norm(gains.N),
         "state_error_in_unknown_input": node.bounds.amplification,

@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import linalg
 
 from duio_mesh.arrays import Array
@@ -152,6 +153,12 @@ def choose_gain(
         )
     rates = np.where(safe, -np.log(radii), -np.inf)
     return float(grid[np.argmax(rates >= _ENOUGH * rates.max())])
+
+
+def modes(values: NDArray[np.complex128]) -> list[str]:
+    """Eigenvalues to be read: "-2", and "0.01 +- 7.4j" once for a conjugate pair."""
+    rounded = np.round(values, 6) + 0.0
+    return [f"{v.real:.4g} +- {v.imag:.4g}j" if v.imag else f"{v.real:.4g}" for v in rounded if v.imag >= 0]
 
 
 def largest_step(sampled_radius: Callable[[float], float], start: float, limit: float = 10.0) -> float:

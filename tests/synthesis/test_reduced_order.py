@@ -154,7 +154,7 @@ def test_a_zero_that_all_nodes_share_violates_assumption_1():
         x0=np.zeros(9),
     )
     nodes = (dataclasses.replace(n, C=np.hstack([n.C, np.zeros((3, 1))])) for n in scenario.nodes.values())
-    with pytest.raises(DesignError, match=r"Assumption 1 fails: .* do not show the modes at \[0\.25"):
+    with pytest.raises(DesignError, match=r"Assumption 1 fails: .* do not show the modes at \['0\.25'\]"):
         synthesise(with_nodes(dataclasses.replace(scenario, plant=larger), *nodes))
 
 
