@@ -1,0 +1,100 @@
+"""One node of the observer by distributed optimisation (seed 002): local estimate, then fusion with the neighbours.
+
+Per step k, with T_i = [P_i; C_i] (the part of the state that this node can follow alone, and what it measures):
+
+    xi_i(k) = [s_i(k); y_i(k)]                                   local, no message
+    x_i(k)  = fusion of all xi_j(k)                              ``fusion``: nu - 1 exchanges, or D, or ``rounds``
+    s_i(k+1) = Abar_i s_i(k) - P_i L_i y_i(k) + P_i B_i u_i(k)   (5)
+
+With a distributed set-up, step 0 begins with D more rounds in which the nodes find H = sum_j T_j'T_j themselves: the
+exact mean of the n (n+1)/2 numbers of T_j'T_j over the island, times the island's size.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+
+from duio_mesh.arrays import Array, contiguous
+from duio_mesh.observers.base import Estimate
+from duio_mesh.observers.fusion import FiniteTimeAverage, Fusion, fusion_rounds, make_fusion
+from duio_mesh.spec import NodeSpec
+
+OnRound = Callable[[int, float, float], None]
+"""Called as on_round(r, residual, disagreement) for the iterate that round r exchanges."""
+
+
+class Observer:
+    """The step machine; ``spec.matrices`` holds Abar, PL, PB, T, s0 and, where the launcher found H, Hinv."""
+
+    def __init__(self, spec: NodeSpec) -> None:
+        m, n = spec.matrices, spec.n
+        self._hears, self._options, self._T = spec.hears, spec.options, m["T"]
+        self._local = contiguous(np.hstack([m["Abar"], -m["PL"], m["PB"]]))
+        states = m["Abar"].shape[0]
+        self._own = np.zeros(states + spec.p + spec.m)  # [s; y; u], written in place
+        self._s, self._xi = self._own[:states], self._own[: states + spec.p]
+        self._y, self._u = self._own[states : states + spec.p], self._own[states + spec.p :]
+        self._next = m["s0"].copy()
+        self._xhat = np.zeros(n)
+        self.on_round: OnRound | None = None
+        """Set it before a step to watch that step's rounds: |T_i x_i - xi_i| and the largest |x_i - x_j| heard."""
+        self._fusion: Fusion | None = None
+        self._setup = FiniteTimeAverage({}, (), 0)
+        if spec.options["setup"] == "distributed":
+            self._setup = FiniteTimeAverage(spec.hears, spec.options["eigenvalues"], n * (n + 1) // 2)
+            self._setup.state[:] = (m["T"].T @ m["T"])[np.tril_indices(n)]
+        else:
+            self._fusion = make_fusion(m["T"], m.get("Hinv"), spec.hears, spec.options)
+        self._ahead = self._setup.rounds  # rounds before the fusion's first, in this step
+
+    @property
+    def rounds(self) -> int:
+        """Exchanges of the current step; the set-up adds some to step 0."""
+        return self._ahead + fusion_rounds(self._options)
+
+    def sample(self, y: Array, u: Array) -> None:
+        """xi_i(k), and s_i(k+1), which needs no neighbour."""
+        self._s[:] = self._next
+        self._y[:], self._u[:] = y, u
+        np.dot(self._local, self._own, out=self._next)
+        if self._fusion is not None:
+            self._ahead = 0
+            self._fusion.begin(self._xi)
+        elif not self._ahead:
+            self._finish_setup()
+
+    def message(self, r: int) -> Array:
+        """The iterate x_i (n,); in a set-up round n (n+1)/2 numbers, the lower triangle of a mean of T_j'T_j."""
+        if r < self._ahead or self._fusion is None:
+            return self._setup.message(r)
+        return self._fusion.message(r - self._ahead)
+
+    def exchange(self, r: int, received: Mapping[int, Array]) -> None:
+        """The next iterate from the neighbours' present ones."""
+        if self._fusion is not None:
+            if self.on_round is not None:
+                self._tell(self.on_round, r, self._fusion.state, received)
+            self._fusion.exchange(r - self._ahead, received)
+            return
+        self._setup.exchange(r, received)
+        if r + 1 == self._ahead:
+            self._finish_setup()
+
+    def estimate(self) -> Estimate:
+        """x_i after the last round."""
+        return Estimate(self._xhat if self._fusion is None else self._fusion.state)
+
+    def _finish_setup(self) -> None:
+        """H from the mean of all T_j'T_j. Every node's copy differs in the last bits; nothing compares them."""
+        n = self._T.shape[1]
+        H: Array = np.zeros((n, n))
+        H[np.tril_indices(n)] = self._options["island_size"] * self._setup.state
+        H += np.tril(H, -1).T
+        self._fusion = make_fusion(self._T, np.linalg.inv(H).astype(np.float64), self._hears, self._options)
+        self._fusion.begin(self._xi)
+
+    def _tell(self, on_round: OnRound, r: int, x: Array, received: Mapping[int, Array]) -> None:
+        apart = max((float(np.linalg.norm(x - other)) for other in received.values()), default=0.0)
+        on_round(r - self._ahead, float(np.linalg.norm(self._T @ x - self._xi)), apart)

@@ -1,0 +1,125 @@
+"""Distributed unknown-input observer by distributed optimisation (seed 002): conditions, gains, certificate.
+
+Discrete time, undirected graphs, also in several parts: every island must reconstruct the state on its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from duio_mesh.errors import DesignError
+from duio_mesh.geometry import stable_radius
+from duio_mesh.scenario.model import Scenario
+from duio_mesh.spec import NodeSpec
+from duio_mesh.synthesis.admm_local import LEAST_CURVATURE, Local, check_joint, facts, local_estimates, noise_gain
+from duio_mesh.synthesis.admm_options import Options
+from duio_mesh.synthesis.admm_rates import Island, fusion_radius, island_facts, iterates, spectrum, worst_error
+from duio_mesh.synthesis.design import Design, Progress, node_spec, plant_spec
+
+__all__ = ["Options", "design"]
+
+_ROUNDING = 1e-6  # finite_time must be exact to this, or the graph has too many different eigenvalues
+
+
+def design(scenario: Scenario, progress: Progress) -> Design:
+    """Local estimates, H and the fusion's constants for every node.
+
+    Raises DesignError when the plant is not discrete, the graph not undirected, a node has no stable local estimate, an
+    island cannot reconstruct the state (Assumption 2, with the missing directions), or the fusion does not converge.
+    """
+    options: Options = scenario.options
+    if scenario.plant.time != "discrete":
+        raise DesignError("admm needs a discrete plant (time: discrete); its local estimates are difference equations")
+    progress("what each node can follow alone")
+    nodes, stability = local_estimates(scenario, options), stable_radius(options.stable_radius)
+    islands: dict[int, Island] = {}
+    described = []
+    for ids in scenario.graph.islands():
+        progress(f"fusion of nodes {list(ids)}")
+        eigenvalues = check_joint(ids, nodes, stability)
+        island = _island(scenario, ids, nodes)
+        radius = _converges(island, options)
+        gains = noise_gain((nodes[i] for i in ids), island.inverse)
+        described.append(island_facts(island, options, eigenvalues, radius, gains))
+        islands |= dict.fromkeys(ids, island)
+    specs = {i: _spec(scenario, i, local, islands[i]) for i, local in nodes.items()}
+    return Design(scenario, plant_spec(scenario), specs, _certificate(options, nodes, islands, described))
+
+
+def _island(scenario: Scenario, ids: tuple[int, ...], nodes: Mapping[int, Local]) -> Island:
+    graph = scenario.graph
+    at = [graph.ids.index(i) for i in ids]
+    L = graph.laplacian()[np.ix_(at, at)]
+    if not np.array_equal(L, L.T):
+        raise DesignError(
+            f"admm needs an undirected graph (edges:), but among nodes {list(ids)} some arcs go one way only"
+        )
+    T = tuple(nodes[i].T for i in ids)
+    H = sum((Ti.T @ Ti for Ti in T), np.zeros_like(scenario.plant.A))
+    return Island(ids, T, L, H, np.asarray(np.linalg.inv(H)))
+
+
+def _converges(island: Island, options: Options) -> float:
+    """The fusion's spectral radius."""
+    if options.fusion == "finite_time":
+        *_, last = iterates(island, options)
+        if worst_error(last) > _ROUNDING:
+            raise DesignError(
+                f"finite_time loses too many digits on nodes {list(island.ids)}: {len(spectrum(island.L))} rounds end "
+                f"{worst_error(last):.1e} beside the exact mean; use fusion: admm or relaxed on this graph"
+            )
+    radius = fusion_radius(island, options)
+    if radius >= 1:
+        raise DesignError(
+            f"the fusion of nodes {list(island.ids)} does not converge: spectral radius {radius:.6f}; "
+            + ("observer.alpha_factor is too large" if options.alpha_factor > 1 else "H is too ill-conditioned")
+        )
+    return radius
+
+
+def _spec(scenario: Scenario, i: int, local: Local, island: Island) -> NodeSpec:
+    """Its own matrices, H^-1 if the launcher is to provide it, and scalars."""
+    options: Options = scenario.options
+    P, L = local.filter.P, local.filter.L
+    matrices = {"Abar": local.filter.Abar, "PL": P @ L, "PB": local.PB, "T": local.T, "s0": local.s0}
+    given: dict[str, Any] = {"fusion": options.fusion, "setup": options.setup}
+    if options.needs_H and options.setup == "global":
+        matrices["Hinv"] = island.inverse
+    if options.fusion == "admm":
+        given |= {"gamma": options.gamma, "nu": options.nu, "alpha_factor": options.alpha_factor}
+    elif options.fusion == "relaxed":
+        given |= {"c": options.c, "rounds": options.rounds}
+    if options.fusion == "finite_time" or options.setup == "distributed":
+        given |= {"island_size": len(island.ids), "eigenvalues": spectrum(island.L)}
+    return node_spec(scenario, i, matrices, given)
+
+
+def _certificate(
+    options: Options, nodes: Mapping[int, Local], islands: Mapping[int, Island], described: list[dict[str, Any]]
+) -> dict[str, Any]:
+    """``spectral_radius`` is that of the error from step to step, which lives in the local estimates alone.
+
+    The fusion starts afresh in every step and remembers nothing: after exact fusion the error of every node is
+    H^-1 sum T_i'[e_i; v_i] with e_i(k+1) = Abar_i e_i(k) - P_i L_i v_i(k). A truncated fusion adds at most
+    ``predicted_fusion_error`` times |x(k)|.
+    """
+    curvature = min(1 / island["H_condition"] for island in described)
+    fusion = max(island["fusion_radius"] for island in described)
+    found: dict[str, Any] = {
+        "conditions": {
+            "assumption_2": {"value": curvature, "threshold": f"> {LEAST_CURVATURE:g}", "ok": True},
+            "fusion_radius": {"value": fusion, "threshold": "< 1", "ok": True},
+        },
+        "nodes": {i: facts(local) for i, local in nodes.items()},
+        "spectral_radius": max(local.radius for local in nodes.values()),
+        "islands": described,
+        "fusion": options.fusion,
+    }
+    if options.fusion == "admm":
+        for i, island in islands.items():
+            at = island.ids.index(i)
+            found["nodes"][i]["alpha"] = float(island.step_sizes(options)[at])
+    return found

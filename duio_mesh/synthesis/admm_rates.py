@@ -1,0 +1,189 @@
+"""What the fusion of one island promises, from its matrices alone: error after k rounds, spectral radius, (17)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import islice
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from duio_mesh.arrays import Array
+from duio_mesh.geometry import complement
+from duio_mesh.observers.fusion import fusion_rounds, step_size
+from duio_mesh.synthesis.admm_options import Options
+
+
+class Island(NamedTuple):
+    """The nodes of one connected component, in the order of their ids."""
+
+    ids: tuple[int, ...]
+    T: tuple[Array, ...]  # (r_i, n) each
+    L: Array  # (N, N) Laplacian
+    H: Array  # (n, n) = sum T_i'T_i
+    inverse: Array  # H^-1
+
+    @property
+    def degrees(self) -> Array:
+        """(N,) weighted degrees d_i."""
+        return np.diag(self.L)
+
+    def curvatures(self, normalised: bool) -> Array:
+        """(N, n, n): the matrices of the gradients, H^-1 T_i'T_i or T_i'T_i."""
+        return np.array([(self.inverse if normalised else np.eye(len(self.H))) @ T.T @ T for T in self.T])
+
+    def step_sizes(self, options: Options) -> Array:
+        """(N,) alpha_i of (16), times alpha_factor."""
+        inverse = self.inverse if options.normalised else None
+        plain = [step_size(T, inverse, options.gamma, d) for T, d in zip(self.T, self.degrees, strict=True)]
+        return options.alpha_factor * np.array(plain)
+
+
+def spectrum(L: Array) -> tuple[float, ...]:
+    """The distinct nonzero eigenvalues of a Laplacian in Leja order: each next one far from all before it.
+
+    In that order the intermediate values of the finite-time average stay small.
+    """
+    values = np.linalg.eigvalsh(L)
+    limit = 1e-9 * max(float(values[-1]), 1e-300)
+    groups = np.split(values, np.flatnonzero(np.diff(values) > limit) + 1)
+    left = [float(g.mean()) for g in groups if g.mean() > limit]
+    ordered: list[float] = []
+    while left:
+        best = max(left, key=lambda v: (sum(np.log(abs(v - o)) for o in ordered), v))
+        ordered.append(best)
+        left.remove(best)
+    return tuple(ordered)
+
+
+def iterates(island: Island, options: Options) -> Iterator[Array]:
+    """(N, n, n) after 0, 1, 2, ... exchanges: column j of block i is x_i if the truth is e_j and xi_i = T_i e_j."""
+    run = {"admm": _admm, "finite_time": _finite_time, "relaxed": _relaxed}[options.fusion]
+    return run(island, options)
+
+
+def _spread(L: Array, X: Array) -> Array:
+    """(L kron I) X."""
+    return (L @ X.reshape(len(X), -1)).reshape(X.shape)
+
+
+def _admm(island: Island, options: Options) -> Iterator[Array]:
+    M, alpha = island.curvatures(options.normalised), island.step_sizes(options)[:, None, None]
+    X = alpha * M
+    psi = np.zeros_like(X)
+    while True:
+        yield X
+        phi = options.gamma / 2 * _spread(island.L, X)
+        psi = psi + phi
+        X = X - alpha * (M @ X - M + phi + psi)
+
+
+def _finite_time(island: Island, options: Options) -> Iterator[Array]:
+    X = len(island.T) * island.curvatures(normalised=True)
+    yield X
+    for value in spectrum(island.L):
+        X = X - _spread(island.L, X) / value
+        yield X
+
+
+def _relaxed(island: Island, options: Options) -> Iterator[Array]:
+    M, c = island.curvatures(normalised=True), options.c
+    adjacency, solve = np.diag(island.degrees) - island.L, _relaxed_solve(island, c)
+    X = solve @ M
+    while True:
+        yield X
+        X = solve @ (M + c * _spread(adjacency, X))
+
+
+def _relaxed_solve(island: Island, c: float) -> Array:
+    """(N, n, n): the inverses of H^-1 T_i'T_i + c d_i I."""
+    own = island.curvatures(normalised=True) + c * island.degrees[:, None, None] * np.eye(len(island.H))
+    inverses: Array = np.linalg.inv(own)
+    return inverses
+
+
+def worst_error(X: Array) -> float:
+    """The largest error of any node for any true state of norm 1."""
+    return float(np.linalg.norm(X - np.eye(X.shape[1]), 2, axis=(1, 2)).max())
+
+
+def predicted_errors(island: Island, options: Options, rounds: int) -> dict[int, float]:
+    """``worst_error`` after some numbers of exchanges, among them ``rounds``."""
+    wanted = sorted({0, 1, 2, 5, 10, 20, 30, 40, 50, 60, 80, 100, 200, 500, 1000, 3000, 10000, rounds})
+    kept = [k for k in wanted if k <= rounds]
+    return {k: worst_error(X) for k, X in enumerate(islice(iterates(island, options), rounds + 1)) if k in set(kept)}
+
+
+def fusion_radius(island: Island, options: Options) -> float:
+    """Spectral radius of the fusion's error from round to round; 0 for finite_time, which is exact after its rounds."""
+    n, N = len(island.H), len(island.T)
+    if options.fusion == "finite_time":
+        return 0.0
+    if options.fusion == "relaxed":
+        adjacency = np.diag(island.degrees) - island.L
+        F = options.c * np.einsum("iab,ij->iajb", _relaxed_solve(island, options.c), adjacency).reshape(N * n, N * n)
+        return float(np.abs(np.linalg.eigvals(F)).max())
+    return float(np.abs(np.linalg.eigvals(admm_matrix(island, options))).max())
+
+
+def admm_matrix(island: Island, options: Options) -> Array:
+    """The error recursion of (15) in (x, q), psi = (Q kron I) q with Q the complement of (1, ..., 1).
+
+    The sum of all psi_i is zero for ever; leaving it out removes n eigenvalues 1 that mean nothing.
+    """
+    N, n = len(island.T), len(island.H)
+    Q, unit = complement(np.ones((N, 1)) / np.sqrt(N)), np.eye(n)
+    alpha = np.repeat(island.step_sizes(options), n)[:, None]
+    M = np.zeros((N * n, N * n))
+    for i, block in enumerate(island.curvatures(options.normalised)):
+        M[i * n : (i + 1) * n, i * n : (i + 1) * n] = block
+    half = options.gamma / 2
+    F11 = np.eye(N * n) - alpha * (M + half * np.kron(island.L, unit))
+    F12 = -alpha * np.kron(Q, unit)
+    pull = half * np.kron(Q.T @ island.L, unit)
+    return np.block([[F11, F12], [pull @ F11, np.eye((N - 1) * n) + pull @ F12]])
+
+
+def rounds_to(error: float, island: Island, options: Options, radius: float) -> int | None:
+    """Exchanges until the worst error is below ``error``; None when the fusion does not get there.
+
+    Followed exactly for 500 exchanges, then extrapolated with the spectral radius.
+    """
+    last, reached = 0, np.inf
+    for last, X in enumerate(islice(iterates(island, options), 501)):
+        reached = worst_error(X)
+        if reached <= error:
+            return last
+    if options.fusion == "finite_time" or radius >= 1:
+        return None
+    return last + int(np.ceil(np.log(reached / error) / -np.log(radius)))
+
+
+def theorem_bound(island: Island, options: Options, nu: int, size: float) -> float:
+    """The right-hand side of (17) for |x| = size: bounds |mean of x_i[1..nu] - x|, not the last iterate.
+
+    In the coordinates of the problem that is solved (z = S x, |z| = size, when normalised). The second term is
+    1 / (nu sqrt(lambda_2)) times the bracket, as it follows from (19); the paper prints 1 / sqrt(nu lambda_2).
+    """
+    steps = float(np.sum(1 / island.step_sizes(options)))
+    mu = 1.0 if options.normalised else float(np.linalg.eigvalsh(island.H)[0])
+    first = np.sqrt(steps / (nu * mu)) * size
+    if len(island.T) == 1:
+        return float(first)
+    connectivity = float(np.linalg.eigvalsh(island.L)[1])
+    return float(first + (2 / options.gamma + steps * size**2 / 2) / (nu * np.sqrt(connectivity)))
+
+
+def island_facts(island: Island, options: Options, eigenvalues: Array, radius: float, gains: Array) -> dict[str, Any]:
+    """What the certificate says about one island."""
+    rounds = fusion_rounds({**options.model_dump(), "eigenvalues": spectrum(island.L)})
+    return {
+        "nodes": list(island.ids),
+        "H_eigenvalues": eigenvalues.tolist(),
+        "H_condition": float(eigenvalues[-1] / eigenvalues[0]),
+        "fusion_radius": radius,
+        "rounds": rounds,
+        "rounds_to_1e-6": rounds_to(1e-6, island, options, radius),
+        "predicted_fusion_error": {str(k): e for k, e in predicted_errors(island, options, rounds).items()},
+        "noise_gain": gains.tolist(),
+    }
