@@ -10,6 +10,7 @@ A method called ``name`` is three things that are found by that name:
 from __future__ import annotations
 
 METHODS: tuple[str, ...] = (
+    "admm",
     "augmented",
     "geometric",
     "lmi",

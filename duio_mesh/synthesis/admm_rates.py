@@ -97,7 +97,7 @@ def _relaxed(island: Island, options: Options) -> Iterator[Array]:
 
 def _relaxed_solve(island: Island, c: float) -> Array:
     """(N, n, n): the inverses of H^-1 T_i'T_i + c d_i I."""
-    own = island.curvatures(normalised=True) + c * island.degrees[:, None, None] * np.eye(len(island.H))
+    own: Array = island.curvatures(normalised=True) + c * island.degrees[:, None, None] * np.eye(len(island.H))
     inverses: Array = np.linalg.inv(own)
     return inverses
 
