@@ -132,12 +132,20 @@ def _lqr(lqr: schema.LqrWeights | None, states: Size, m: Size, problems: Problem
     path = (*PLANT, "control", "lqr")
     Q = weight(lqr.Q, (*path, "Q"), problems, states)
     R = weight(lqr.R, (*path, "R"), problems, m)
-    if Q is not None and np.linalg.eigvalsh(Q)[0] < -1e-12 * np.abs(Q).max():
+    if Q is not None and _smallest_eigenvalue(Q) < -1e-12 * np.abs(Q).max():
         problems.at((*path, "Q"), "should be positive semidefinite")
-    if R is not None and np.linalg.eigvalsh(R)[0] <= 0:
+    if R is not None and _smallest_eigenvalue(R) <= 0:
         problems.at((*path, "R"), "should be positive definite")
     reference = _reference(lqr.reference, path, states, problems)
     return None if Q is None or R is None or reference is None else model.Lqr(Q, R, reference)
+
+
+def _smallest_eigenvalue(M: Array) -> float:
+    """Of a symmetric matrix; -inf when the entries are too large to tell."""
+    try:
+        return float(np.linalg.eigvalsh(M)[0])
+    except np.linalg.LinAlgError:
+        return -np.inf
 
 
 def _reference(written: list[float] | None, path: Path, states: Size, problems: Problems) -> Array | None:

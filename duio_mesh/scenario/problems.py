@@ -94,7 +94,8 @@ class Problems:
         """Raise ScenarioError with every problem, file by file in the order of the lines."""
         if not self._found:
             return
-        files = list(dict.fromkeys(place.source for place, _ in self._found))
+        places = [*self._values.values(), *(place for place, _ in self._found)]  # the topology's own top comes first
+        files = list(dict.fromkeys(place.source for place in places))
         ordered = sorted(self._found, key=lambda f: (files.index(f[0].source), f[0].line, f[0].column))
         raise ScenarioError([_one_line(f"{place}: {text}") for place, text in ordered])
 
@@ -109,12 +110,16 @@ def _one_line(text: str) -> str:
     return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
 
 
+def nearest(wrong: object, known: Iterable[object]) -> str | None:
+    """The known word that was probably meant, None when nothing is near."""
+    near = difflib.get_close_matches(str(wrong), [str(k) for k in known], n=1, cutoff=0.65)
+    return near[0] if near else None  # at 0.65 lim is near lmi, but uniform is not near normal
+
+
 def did_you_mean(wrong: object, known: Iterable[object]) -> str:
-    """' (did you mean x?)' for the nearest known word, '' when nothing is near."""
-    near = difflib.get_close_matches(
-        str(wrong), [str(k) for k in known], n=1, cutoff=0.65
-    )  # lim is near lmi, uniform is not near normal
-    return f" (did you mean {near[0]}?)" if near else ""
+    """' (did you mean x?)', or '' when nothing is near."""
+    near = nearest(wrong, known)
+    return "" if near is None else f" (did you mean {near}?)"
 
 
 def listed(words: Iterable[object], last: str = "or") -> str:

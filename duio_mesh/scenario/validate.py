@@ -13,7 +13,7 @@ from typing import Annotated, Any, NamedTuple, TypeVar
 
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
-from duio_mesh.scenario.problems import Path, Problems, counted, did_you_mean, listed
+from duio_mesh.scenario.problems import Path, Problems, counted, did_you_mean, listed, nearest
 
 M = TypeVar("M", bound=BaseModel)
 
@@ -36,19 +36,17 @@ def fields(model: type[BaseModel], value: Any, path: Path, problems: Problems) -
         valid = model.model_validate_json(json.dumps(value), strict=True)
         return {name: getattr(valid, name) for name in model.model_fields}
     except ValidationError as e:
-        _explain(e, model, value, path, problems)
+        misspelt = _explain(e, model, value, path, problems)
         wrong = {error["loc"][0] for error in e.errors() if error["loc"]}
     if not isinstance(value, Mapping):
         return {}
     found: dict[str, Any] = {}
     for name, info in model.model_fields.items():
-        if name in wrong:
-            continue
-        if name not in value:
+        if name in value and name not in wrong:
+            kind: Any = Annotated[(info.annotation, *info.metadata)] if info.metadata else info.annotation
+            found[name] = TypeAdapter(kind).validate_json(json.dumps(value[name]), strict=True)
+        elif name not in wrong and (name,) not in misspelt:
             found[name] = info.get_default(call_default_factory=True, validated_data={})
-            continue
-        kind: Any = Annotated[(info.annotation, *info.metadata)] if info.metadata else info.annotation
-        found[name] = TypeAdapter(kind).validate_json(json.dumps(value[name]), strict=True)
     return found
 
 
@@ -61,29 +59,29 @@ class _Fault(NamedTuple):
     context: Mapping[str, Any]
 
 
-def _explain(error: ValidationError, model: type[BaseModel], value: Any, base: Path, problems: Problems) -> None:
-    found = [_Fault(e["loc"], e["type"], e["msg"], e.get("ctx", {})) for e in error.errors(include_url=False)]
-    faults = _settle(found, value)
-    suggested: set[Path] = set()  # missing keys that are there, misspelt
+def _explain(error: ValidationError, model: type[BaseModel], value: Any, base: Path, problems: Problems) -> set[Path]:
+    """Report every problem; returns the keys that are there, but misspelt: their absence is no second problem."""
+    faults = [_Fault(e["loc"], e["type"], e["msg"], e.get("ctx", {})) for e in error.errors(include_url=False)]
+    faults = _settle(faults, value)
+    misspelt: set[Path] = set()
     for fault in faults:
         if fault.type == "extra_forbidden":
             *around, key = fault.loc
-            schema = _schema(model)
-            known = _keys(schema, schema, tuple(around))
-            near = did_you_mean(key, known)
-            missing = next((k for k in known if near.endswith(f" {k}?)")), None)
-            if missing is not None:
-                suggested.add((*around, missing))
-            message = "unknown key" + (near or f"; the keys here are {listed(sorted(known), 'and')}")
-            problems.at_key((*base, *fault.loc), message)
+            known = _keys(_schema(model), _schema(model), tuple(around))
+            meant = nearest(key, known)
+            if meant is not None:
+                misspelt.add((*around, meant))
+            hint = did_you_mean(key, known) or f"; the keys here are {listed(sorted(known), 'and')}"
+            problems.at_key((*base, *fault.loc), f"unknown key{hint}")
     for fault in faults:
         path = (*base, *fault.loc)
-        if fault.type == "missing" and fault.loc not in suggested:
+        if fault.type == "missing" and fault.loc not in misspelt:
             problems.at_key(path, "is missing")
         elif fault.context.get("at"):
             problems.at_key((*path, fault.context["at"]), fault.message)
         elif fault.type not in ("missing", "extra_forbidden"):
             problems.at(path, _words(fault, _reach(value, fault.loc)))
+    return misspelt
 
 
 @functools.cache
