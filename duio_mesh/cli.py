@@ -102,7 +102,7 @@ def _main(args: argparse.Namespace) -> int:
     from duio_mesh import console
 
     processes = not (args.in_process or args.check or args.dry_run)
-    with _nursery() if processes else contextlib.nullcontext() as supervisor:
+    with _nursery(recorder=not args.no_record) if processes else contextlib.nullcontext() as supervisor:
         with console.working("designing the observers") as say:
             design = synthesis.synthesise(scenario, say)
         if args.check:
@@ -117,11 +117,13 @@ def _main(args: argparse.Namespace) -> int:
 
 
 @contextlib.contextmanager
-def _nursery() -> Iterator[Supervisor]:
-    """A nursery that gets ready while the gains are designed."""
+def _nursery(*, recorder: bool) -> Iterator[Supervisor]:
+    """A nursery that gets ready while the gains are designed, and perhaps a recorder in it."""
     from duio_mesh.supervisor import Supervisor
 
     with Supervisor() as supervisor:
+        if recorder:
+            supervisor.prepare("recorder")
         yield supervisor
 
 

@@ -64,9 +64,11 @@ class Journal:
         self._filled = 0
 
 
-def read_rows(path: str | Path, size: int) -> Array:
-    """The whole rows (K, size) of a journal file; a row cut short by a crash is left out, no file is no rows."""
-    if not Path(path).exists():
-        return np.zeros((0, size))
-    data = np.fromfile(path, dtype="<f8")
-    return data[: data.size - data.size % size].reshape(-1, size)
+def map_rows(path: str | Path, size: int) -> Array:
+    """The whole rows (K, size) of a journal file, mapped rather than read.
+
+    A row that was cut short by a crash is left out; no file is no rows.
+    """
+    file = Path(path)
+    count = file.stat().st_size // (8 * size) if file.exists() else 0
+    return np.memmap(file, dtype="<f8", mode="r", shape=(count, size)) if count else np.zeros((0, size))

@@ -30,7 +30,8 @@ from duio_mesh.supervisor import Supervisor
 from duio_mesh.synthesis.design import Design
 
 LOOPBACK = "127.0.0.1"
-CLOSING = 60.0  # seconds for the recorder to fill gaps and close its file after a long run
+CLOSING = 10.0  # seconds for the recorder to fill gaps and close its file ...
+CLOSING_ROWS = 50_000  # ... and a second more for every so many rows
 
 
 @dataclass(frozen=True)
@@ -75,7 +76,9 @@ class Launch:
         at = {i: self._reserve() for i in ids}
         plant = self._reserve()
         specs: dict[str, NodeSpec | PlantSpec | RecorderSpec] = {
-            "plant": replace(design.plant, wire=Wire(run, (plant,), ()), output=str(folder.rows("plant")))
+            "plant": replace(
+                design.plant, wire=Wire(run, (plant,), ()), output=str(folder.rows("plant")), recorded=self._record
+            )
         }
         for i, spec in design.nodes.items():
             neighbours = sorted(set(spec.hears) | set(spec.tells))
@@ -119,7 +122,8 @@ class Launch:
             if self._record:
                 if hold and (url := self._supervisor.processes["recorder"].said.get("url")):
                     hold(url)
-                self._supervisor.finish("recorder", CLOSING)
+                rows = self._design.plant.steps * len(self._sizes)
+                self._supervisor.finish("recorder", CLOSING + rows / CLOSING_ROWS)
         finally:
             for s in self._held:
                 s.close()
@@ -250,9 +254,9 @@ def _finish(
     """trace.npz, metrics.json and, with ``record``, the recording of a finished trace."""
     write_trace(folder.root / "trace.npz", trace)
     if record:
-        from duio_mesh.report.recording import record_trace
+        from duio_mesh.report.record_trace import record_trace
 
-        record_trace(folder.root / "recording.rrd", design, trace)
+        record_trace(folder.root / "recording.rrd", design.scenario, trace)
     report = metrics(trace, design.scenario, counts)
     (folder.root / "metrics.json").write_text(json.dumps(report, indent=2) + "\n")
     folder.tidy()

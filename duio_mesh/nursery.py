@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import gc
+import importlib
 import json
 import os
 import select
@@ -51,6 +52,7 @@ class Nursery:
     def __init__(self, control: socket.socket, status: int) -> None:
         self._control, self._status = control, status
         self._children: dict[int, str] = {}  # pid -> who
+        self._prepared: dict[str, int] = {}  # who -> pipe on which it waits for its order
 
     def serve(self) -> None:
         """Obey the launcher until it closes its end; then end what still runs."""
@@ -76,16 +78,24 @@ class Nursery:
         self._end_all(wake_read)
 
     def _obey(self, order: dict[str, Any]) -> None:
-        if "start" in order:
-            pid = self._fork(order)
-            self._children[pid] = order["who"]
-            self._tell({"event": "started", "who": order["who"], "pid": pid})
+        who = order["who"]
+        if "prepare" in order:
+            read, self._prepared[who] = os.pipe()
+            self._children[self._fork(order, read)] = who
+            os.close(read)
+        elif who in self._prepared and "start" in order:
+            pipe = self._prepared.pop(who)
+            with contextlib.suppress(BrokenPipeError):  # it died meanwhile, and that will be said
+                os.write(pipe, json.dumps(order).encode())
+            os.close(pipe)
+        elif "start" in order:
+            self._children[self._fork(order)] = who
         else:
-            for pid, who in self._children.items():
-                if who == order["who"]:
-                    os.kill(pid, order["signal"])
+            for pid in [pid for pid, name in self._children.items() if name == who]:
+                os.kill(pid, order["signal"])
 
-    def _fork(self, order: dict[str, Any]) -> int:
+    def _fork(self, order: dict[str, Any], waits_on: int = -1) -> int:
+        """A child that obeys ``order``, or one that gets ready and then obeys what comes on ``waits_on``."""
         parent = os.getpid()
         pid = os.fork()
         if pid:
@@ -96,10 +106,18 @@ class Nursery:
             signal.signal(signal.SIGCHLD, signal.SIG_DFL)
             self._control.close()
             # ended with the nursery, even when that is killed; the recorder gets to close its file
-            last_word = signal.SIGTERM if order["start"] == "recorder" else signal.SIGKILL
+            recorder = order["who"] == "recorder"
+            last_word = signal.SIGTERM if recorder else signal.SIGKILL
             ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, int(last_word))
             if os.getppid() == parent:
                 setproctitle.setproctitle(f"duio-{order['who']}")
+                for pipe in self._prepared.values():
+                    os.close(pipe)
+                if waits_on >= 0:
+                    importlib.import_module("duio_mesh.recorder")  # the half second that is worth preparing
+                    order = json.loads(os.read(waits_on, 4096) or "null")
+                    if order is None:
+                        os._exit(0)  # the nursery closes before there was anything to do
                 errors = os.open(order["errors"], os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600)
                 os.dup2(errors, 1)
                 os.dup2(errors, 2)

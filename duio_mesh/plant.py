@@ -16,6 +16,8 @@ from duio_mesh.mesh import Mesh, Source
 from duio_mesh.process import Report, main
 from duio_mesh.spec import PlantSpec
 
+RECORDER = 3.0  # seconds to wait for a recorder, so that short runs can be seen from their beginning
+
 
 class Credits:
     """How many steps each node has finished."""
@@ -64,9 +66,11 @@ def run(spec: PlantSpec, report: Report) -> None:
         keys, ids = mesh.keys, [s.id for s in spec.sensors]
         nodes = [mesh.hear(keys.credit(i), f"{i} -> plant", f"node-{i}", ready=(i, "plant")) for i in ids]
         samples = {i: mesh.speak([(keys.plant(i), f"plant -> {i}", ("plant", i))]) for i in ids}
-        truth = mesh.speak([(keys.truth(), "plant -> recorder", None)], drop=True)
         mesh.watch()
         mesh.meet()
+        truth = mesh.speak([(keys.truth(), "plant -> recorder", ("plant", "recorder"))], drop=True)
+        if spec.recorded and mesh.unanswered(RECORDER):  # it then reads what it missed from the journals
+            report.warn(f"the recorder was not there after {RECORDER:g} s; starting without it")
         report("ready")
         credits, begin = Credits(mesh, nodes, spec), time.monotonic()
         with Journal(spec.output, plant.x.size, truth) as journal:

@@ -79,4 +79,6 @@ def main(kind: type[Spec], run: Callable[[Spec, Report], None]) -> NoReturn:
     parser = argparse.ArgumentParser(description=f"Run one process of a duio_mesh run from its {kind.__name__}.")
     parser.add_argument("--spec", type=Path, required=True, help="spec file that the launcher or an export wrote")
     args = parser.parse_args()
-    sys.exit(live(kind, run, args.spec, Report(args.spec.stem, 1)))
+    code = live(kind, run, args.spec, Report(args.spec.stem, 1))
+    sys.stderr.flush()
+    os._exit(code)  # everything is closed; a thread that still talks to a frozen peer must not keep us

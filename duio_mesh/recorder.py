@@ -11,19 +11,36 @@ import time
 from contextlib import suppress
 from queue import Empty, SimpleQueue
 
-from duio_mesh.journal import PERIOD, read_rows
+from duio_mesh.journal import PERIOD, map_rows
 from duio_mesh.mesh import Frame, Mesh, Source
 from duio_mesh.process import Report, main
 from duio_mesh.report.recording import Recording
 from duio_mesh.spec import RecorderSpec
 
+RATE_PERIOD = 0.5  # seconds between two values of the rates
+
+
+class Rates:
+    """Steps per second of plant and nodes, from how far they have come."""
+
+    def __init__(self, recording: Recording) -> None:
+        self._recording, self._at, self._seen = recording, time.monotonic(), dict[str, int]()
+
+    def look(self, newest: dict[str, int]) -> None:
+        """Log the rates once in a while."""
+        now = time.monotonic()
+        if (passed := now - self._at) < RATE_PERIOD:
+            return
+        rates = {f"{who} steps": (k - self._seen.get(who, 0)) / passed for who, k in newest.items()}
+        self._recording.rates(max(0, max(newest.values()) - 1), rates)
+        self._at, self._seen = now, dict(newest)
+
 
 def run(spec: RecorderSpec, report: Report) -> None:
     """Record until SIGTERM, then complete and close the recording."""
-    recording = Recording(spec)
     finishing = SimpleQueue[None]()
     changes = SimpleQueue[tuple[str, bool]]()
-    with Mesh(spec.wire, "recorder", report.warn) as mesh:
+    with Recording(spec) as recording, Mesh(spec.wire, "recorder", report.warn) as mesh:
 
         def finish(*_: object) -> None:
             finishing.put(None)
@@ -31,50 +48,42 @@ def run(spec: RecorderSpec, report: Report) -> None:
 
         signal.signal(signal.SIGTERM, finish)
         keys = mesh.keys
-        of: dict[Source, int | None] = {mesh.hear(keys.truth(), "plant -> recorder", "plant"): None}
+        node_of: dict[Source, int | None] = {}
         for i in spec.sizes:
-            of[mesh.hear(keys.trace(i), f"{i} -> recorder", f"node-{i}")] = i
+            node_of[mesh.hear(keys.trace(i), f"{i} -> recorder", f"node-{i}")] = i
+        # last, because the plant starts when it sees this one
+        node_of[mesh.hear(keys.truth(), "plant -> recorder", "plant", ("plant", "recorder"))] = None
         mesh.watch(lambda who, alive: changes.put((who, alive)))
         report("ready", url=recording.url)
         newest = {"plant": 0} | {f"node-{i}": 0 for i in spec.sizes}
-        due = time.monotonic() + PERIOD
+        rates, due = Rates(recording), time.monotonic() + PERIOD
         while finishing.empty() or mesh.pending():
             with suppress(Empty):
                 if got := mesh.get(PERIOD):
                     source, frame = got
-                    newest[source.who] = _keep(recording, spec, of[source], frame)
+                    newest[source.who] = _keep(recording, spec, node_of[source], frame)
             while not changes.empty():
                 who, alive = changes.get()
                 if who in newest:
-                    recording.liveness(who, "up" if alive else "down", newest[who])
+                    recording.liveness(who, "up" if alive else "down", max(0, newest[who] - 1))
             if time.monotonic() >= due:
+                rates.look(newest)
                 recording.flush()
                 due = time.monotonic() + PERIOD
-    _complete(recording, spec)
-    recording.close()
+        recording.fill(
+            map_rows(spec.truth, spec.n), {i: map_rows(path, spec.sizes[i]) for i, path in spec.estimates.items()}
+        )
     report("done", rejected=mesh.rejections())
 
 
 def _keep(recording: Recording, spec: RecorderSpec, node: int | None, frame: Frame) -> int:
     """Hand one batch to the recording; the step after its last row."""
-    size = spec.n if node is None else spec.sizes[node]
-    rows = frame.vector.reshape(-1, size)
+    rows = frame.vector.reshape(-1, spec.n if node is None else spec.sizes[node])
     if node is None:
         recording.truth(frame.k, rows)
     else:
         recording.estimates(node, frame.k, rows)
     return frame.k + len(rows)
-
-
-def _complete(recording: Recording, spec: RecorderSpec) -> None:
-    """Read what never arrived from the journals."""
-    for node, ranges in recording.missing().items():
-        path, size = (spec.truth, spec.n) if node is None else (spec.estimates[node], spec.sizes[node])
-        rows = read_rows(path, size)
-        for first, last in ranges:
-            frame = Frame(first, 0, rows[first:last].ravel())
-            if frame.vector.size:
-                _keep(recording, spec, node, frame)
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ import numpy as np
 
 from duio_mesh.arrays import Array
 from duio_mesh.errors import RunError
-from duio_mesh.journal import read_rows
+from duio_mesh.journal import map_rows
 from duio_mesh.simulation import Trace, estimate_sizes, split_trace
 from duio_mesh.synthesis.design import Design
 
@@ -65,8 +65,8 @@ class RunFolder:
     def gather(self, design: Design) -> Trace:
         """The trace of all rows that were written; what a process never wrote is NaN."""
         sizes = estimate_sizes(design)
-        x = read_rows(self.rows("plant"), design.scenario.plant.n)
-        rows = {i: read_rows(self.rows(f"node-{i}"), size) for i, size in sizes.items()}
+        x = map_rows(self.rows("plant"), design.scenario.plant.n)
+        rows = {i: map_rows(self.rows(f"node-{i}"), size) for i, size in sizes.items()}
         steps = max(map(len, rows.values()))
         return split_trace(design, _padded(x, steps), {i: _padded(r, steps) for i, r in rows.items()})
 

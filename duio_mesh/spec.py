@@ -83,6 +83,7 @@ class PlantSpec:
     steps: int
     window: int  # steps it may be ahead of the slowest node
     deadline: float
+    recorded: bool = False  # there is a recorder to wait for, a little
     output: str = ""  # file of the true state, float64 rows
     wire: Wire = UNWIRED
 

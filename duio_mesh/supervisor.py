@@ -34,7 +34,6 @@ class Process:
 
     def __init__(self, who: str) -> None:
         self.who = who
-        self.pid = 0
         self.said: dict[str, Any] = {}  # what it reported when it was ready
         self.done: dict[str, Any] = {}  # its last words when all went well
         self.failure = ""  # what it says went wrong
@@ -86,9 +85,14 @@ class Supervisor:
             self._nursery.kill()  # its children die with it
             self._nursery.wait()
 
+    def prepare(self, who: str) -> None:
+        """Let a process that takes long to import get ready before there is anything to give it."""
+        self.processes[who] = Process(who)
+        self._order({"prepare": who, "who": who})
+
     def start(self, who: str, kind: str, spec: Path, log: Path, errors: Path) -> None:
         """Start one process."""
-        self.processes[who] = Process(who)
+        self.processes.setdefault(who, Process(who))
         self._order({"start": kind, "who": who, "spec": str(spec), "log": str(log), "errors": str(errors)})
 
     def kill(self, who: str, number: int) -> None:
@@ -170,9 +174,7 @@ class Supervisor:
 
     def _hear(self, event: dict[str, Any]) -> None:
         process, what = self.processes[event["who"]], event["event"]
-        if what == "started":
-            process.pid = event["pid"]
-        elif what == "ready":
+        if what == "ready":
             process.said = event
         elif what == "done":
             process.done = event

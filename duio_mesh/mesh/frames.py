@@ -100,12 +100,12 @@ class Decoder:
             raise Rejected("not from the expected source, run and version")
         if crc32(data) != RESIDUE:
             raise Rejected("checksum")
-        end = layout.start + 8 * layout.count
+        end = layout.start + 8 * layout.numbers
         if k_form != _UINT32 or r_form != _UINT32 or header != layout.header or data[end : end + 2] != _BIN8_OF_4:
             raise Rejected("layout")
         if not all(map(isfinite, layout.payload.unpack_from(data, layout.start))):
             raise Rejected("not finite")
-        return Frame(k, r, np.frombuffer(data, FLOAT64, layout.count, layout.start))
+        return Frame(k, r, np.frombuffer(data, FLOAT64, layout.numbers, layout.start))
 
     def _learn(self, data: bytes) -> _Layout:
         """The layout of frames of this length; a length that no payload gives is refused."""
@@ -124,7 +124,7 @@ class Decoder:
             head=struct.Struct(f">{len(self._prefix)}sBIBI{len(header)}s"),
             header=header,
             start=head + len(header),
-            count=size // 8,
+            numbers=size // 8,
             payload=struct.Struct(f"<{size // 8}d"),
         )
         if len(self._layouts) < _LAYOUTS:  # who sends frames of every length shall not fill our memory
@@ -138,5 +138,5 @@ class _Layout(NamedTuple):
     head: struct.Struct  # prefix, k, r, header of the payload
     header: bytes
     start: int  # of the payload
-    count: int  # of its numbers
+    numbers: int
     payload: struct.Struct

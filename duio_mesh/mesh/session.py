@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import os
+import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable
@@ -29,6 +30,8 @@ from duio_mesh.errors import RunError
 from duio_mesh.mesh.frames import Decoder, Encoder, Frame, Rejected
 from duio_mesh.mesh.keys import Keys
 from duio_mesh.spec import START, Wire
+
+CLOSE = 2.0  # seconds to end a session in order
 
 Ready: TypeAlias = tuple[int | str, int | str]  # (source, target) of a link, for the start barrier
 
@@ -114,8 +117,15 @@ class Mesh:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
-        # always: a live subscriber would keep the interpreter from ever exiting
-        self._session.close()  # type: ignore[no-untyped-call]
+        """Close the session, which sends what is still queued: always, or the interpreter might never exit.
+
+        A frozen peer would hold that up for ever; after ``CLOSE`` seconds we leave without it.
+        """
+        closing = threading.Thread(target=self._session.close, daemon=True)
+        closing.start()
+        closing.join(CLOSE)
+        if closing.is_alive():
+            self._warn(f"left without an orderly end: a peer did not take what was queued for it within {CLOSE:g} s")
 
     # -- declaring --------------------------------------------------------------------------------------------------
 
@@ -168,25 +178,32 @@ class Mesh:
     # -- the start barrier ------------------------------------------------------------------------------------------
 
     def meet(self, timeout: float = START) -> None:
-        """Wait until every link of this process has somebody at its other end.
+        """Wait until every link that was declared so far has somebody at its other end.
 
         Raises RunError naming the links that nobody answered.
         """
+        if missing := ", ".join(self.unanswered(timeout)):
+            raise RunError(f"{self.who}: nobody answered on {missing} within {timeout:g} s of the start")
+
+    def unanswered(self, timeout: float) -> list[str]:
+        """The links, of those declared since the last call, that still have nobody at their other end."""
+        meeting, self._meeting = self._meeting, {}
         matched: set[str] = set()
         news = SimpleQueue[str]()
-        for name, publisher in self._meeting.items():
+        for name, publisher in meeting.items():
             self._kept.append(
                 publisher.declare_matching_listener(lambda s, name=name: news.put(name) if s.matching else None)
             )
             if publisher.matching_status.matching:
                 news.put(name)
         end = time.monotonic() + timeout
-        while len(matched) < len(self._meeting):
+        while len(matched) < len(meeting):
             try:
                 matched.add(news.get(timeout=max(0.0, end - time.monotonic())))
             except Empty:
-                missing = ", ".join(name for name in self._meeting if name not in matched)
-                raise RunError(f"{self.who}: nobody answered on {missing} within {timeout:g} s of the start") from None
+                break
+        self._kept += meeting.values()
+        return [name for name in meeting if name not in matched]
 
     # -- receiving --------------------------------------------------------------------------------------------------
 

@@ -14,7 +14,7 @@ import psutil
 
 from tests.conftest import ROOT, TOPOLOGIES, wait_for
 
-LONG = 10_000_000  # steps: more than any test lets pass
+LONG = 2_000_000  # steps: more than any test lets pass
 
 
 class Running:

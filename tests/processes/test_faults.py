@@ -13,7 +13,7 @@ from tests.processes.running import Running
 
 pytestmark = [pytest.mark.mesh, pytest.mark.usefixtures("nothing_left")]
 
-TOPOLOGY = "ring.yaml"
+TOPOLOGY = "augmented_heat_ring.yaml"
 ENDING = 5.0  # seconds that an end may take
 SLACK = 5.0  # for a loaded machine
 
@@ -76,7 +76,7 @@ def test_an_interrupted_run_keeps_what_it_has(number: signal.Signals, code: int)
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
 def test_a_run_does_not_need_its_recorder(number: signal.Signals) -> None:
     """Killed or frozen in the middle, it costs neither the run nor the trace; the recording is made good."""
-    steps = 20_000
+    steps = 5_000
     with Running(TOPOLOGY, steps=steps) as run:
         run.until_ready("recorder")
         run.until_row("node-1", 100)
