@@ -9,6 +9,7 @@ here (file sink, server sink, reader), neither opens a connection nor touches a 
 
 from __future__ import annotations
 
+import atexit
 import os
 import socket
 from collections.abc import Iterable
@@ -25,6 +26,7 @@ from numpy.typing import NDArray
 
 LOOPBACK = "127.0.0.1"
 WRITE = 60.0  # seconds that the disk may take for what is still to be written
+ABANDON = 60.0  # seconds that the end of this process may be held up by a viewer that is frozen
 LINGER = 2.0  # seconds that a viewer has at the end for what it has not read yet
 QUEUE = 2048  # batches that wait for the live server; further ones are dropped
 HISTORY = "256MiB"  # what the live server keeps for a viewer that comes late
@@ -130,8 +132,10 @@ class LiveStream:
             self._abandoned = True
         self._thread.join(LINGER)
         if self._thread.is_alive():
+            # Rerun gives up on a frozen viewer after about 20 s; a process that ends earlier, other than by os._exit,
+            # has to wait for that: its end would catch the thread in Rerun's code and abort
             self._abandoned = True
-            rr.unregister_shutdown()  # it would wait for the frozen viewer when this process ends
+            atexit.register(self._thread.join, ABANDON)
 
     def _serve(self) -> tuple[rr.RecordingStream, str]:
         for _ in range(PORTS):
