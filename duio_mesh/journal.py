@@ -6,12 +6,14 @@ import time
 from collections.abc import Iterable
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
 from duio_mesh.arrays import Array
-from duio_mesh.mesh import Outlet
+
+if TYPE_CHECKING:  # the launcher reads journals and must not load Zenoh
+    from duio_mesh.mesh import Outlet
 
 PERIOD = 0.05  # seconds between batches: a viewer's eye, and cheap
 BATCH_BYTES = 1 << 16
