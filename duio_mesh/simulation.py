@@ -24,9 +24,11 @@ def simulate(design: Design, progress: Callable[[int], None] = lambda _: None) -
         for i, observer in observers.items():
             p = design.nodes[i].p
             observer.sample(data[i][:p], data[i][p:])
-        for r in range(max(o.rounds for o in observers.values())):
-            sent = {i: o.message(r).copy() for i, o in observers.items()}
-            for i, observer in observers.items():
+        rounds = {i: o.rounds for i, o in observers.items()}  # islands may need different numbers of them
+        for r in range(max(rounds.values())):
+            turn = {i: o for i, o in observers.items() if r < rounds[i]}
+            sent = {i: o.message(r).copy() for i, o in turn.items()}
+            for i, observer in turn.items():
                 observer.exchange(r, {j: sent[j] for j in design.nodes[i].hears})
         for i, observer in observers.items():
             rows[i].append(np.concatenate(observer.estimate()))
