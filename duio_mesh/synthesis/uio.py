@@ -1,11 +1,12 @@
-"""E_i and P_i: taking the inputs that a node does not know out of its error (seed 000, section 4.1; seed 001, H = -E)."""
+"""E_i and P_i: take the inputs that a node is not told out of its error (seed 000, section 4.1; seed 001, H = -E)."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from duio_mesh.arrays import Array
 from duio_mesh.errors import DesignError
@@ -33,7 +34,7 @@ def decouple(C: Array, Bbar: Array, node: str = "a node", unknown: Sequence[str]
     """E and P for y = C x (p, n) and the matrix Bbar (n, .) of the inputs that the node is not told.
 
     Only im Bbar matters: E = -B̄ (C B̄)^+ is the same for every basis B̄ of it, so zero and dependent columns are left
-    out (seed 000, Remark 1). Without an unknown input E = 0 and P = I (Remark 2). The rank of C is measured, not demanded.
+    out (seed 000, Remark 1). Without an unknown input E = 0 and P = I (Remark 2). rank C is measured, not demanded.
     Raises DesignError when Assumption 2, rank(C B̄) = rank(B̄), fails; ``node`` and ``unknown`` (names) are for its text.
     Source: seed 000, (6)-(10) with H_i = 0.
     """
@@ -71,12 +72,12 @@ def _least(M: Array, wanted: int) -> float:
     return min(1.0, float(np.linalg.svd(M, compute_uv=False)[wanted - 1])) if min(M.shape) >= wanted else 0.0
 
 
-def _cannot_decouple(seen: Array, p: int, r: int, node: str, unknown: Sequence[str]) -> str:
+def _cannot_decouple(seen: NDArray[np.floating[Any]], p: int, r: int, node: str, unknown: Sequence[str]) -> str:
     names = f" ({', '.join(unknown)})" if unknown else ""
     values = ", ".join(f"{value:.3g}" for value in seen)
     return (
-        f"{node}: Assumption 2 fails: rank(C_i B_iw) = {np.sum(seen > RTOL)}, but {r} independent unknown inputs{names} "
-        f"act on the plant. Singular values of C_i B_iw, free of units: [{values}]. "
-        f"{f'It has only {p} measurements. ' if p < r else ''}"
+        f"{node}: Assumption 2 fails: rank(C_i B_iw) = {np.sum(seen > RTOL)}, but rank(B_iw) = {r}: the inputs that it "
+        f"is not told{names} cannot be told apart in its measurements. Singular values, free of units: [{values}]. "
+        f"{f'More unknown inputs than measurements ({p}). ' if p < r else ''}"
         "Let it know one of these inputs, or let it measure a state that they reach within one step."
     )

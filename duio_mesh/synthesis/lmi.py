@@ -1,0 +1,158 @@
+"""Node-wise decomposition DUIO (seed 000): unknown-input decoupling, local output injection, diffusive coupling.
+
+Every gain is designed here from the whole scenario; what a node gets is its own N, M, L, E, G of (16)-(17).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from duio_mesh.errors import DesignError
+from duio_mesh.geometry import (
+    RTOL,
+    GeometryError,
+    detectability_decomposition,
+    observability_decomposition,
+    stable_radius,
+)
+from duio_mesh.geometry.subspace import complement, image
+from duio_mesh.scenario.model import Scenario
+from duio_mesh.scenario.strict import Strict
+from duio_mesh.spec import NodeSpec
+from duio_mesh.synthesis.consensus import Coupling, Undetectable, couple
+from duio_mesh.synthesis.design import Design, Progress, node_spec, plant_spec
+from duio_mesh.synthesis.lmi_network import Local, Network, certificate
+from duio_mesh.synthesis.local_gain import Subsystem, h2_gain, hinf_gain, placed_gain, radius, worst_gain
+from duio_mesh.synthesis.noise import noise_covariance
+from duio_mesh.synthesis.uio import decouple_node
+
+__all__ = ["Options", "design"]
+
+Pole = Annotated[float, Field(gt=-1, lt=1)]
+
+
+class Poles(Strict):
+    """Real poles spread evenly from the first to the second number."""
+
+    poles: tuple[Pole, Pole]
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Poles:
+        if self.poles[0] >= self.poles[1]:
+            raise ValueError("the first pole should be less than the second")
+        return self
+
+
+class Options(Strict):
+    """The keys under ``observer:`` for ``method: lmi``."""
+
+    decomposition: Literal["detectability", "observability"] = "detectability"
+    """What the neighbours must supply: unobservable modes that are not stable, or all unobservable modes."""
+    local_gain: Literal["hinf", "h2"] | Poles = "hinf"
+    """K_id: (34), or the least stationary error variance under the file's noise, or given poles."""
+    consensus: Literal["paper", "norm"] = "norm"
+    """g: (38)-(39) as printed, or the least ||Phi_u||_2, which is (49)."""
+
+
+def design(scenario: Scenario, progress: Progress) -> Design:
+    """Check Assumptions 1 and 2, decompose every node, design K_i and g_i, certify the whole error system (31).
+
+    Raises DesignError when the plant is not discrete, a rank condition fails, a local gain cannot be computed or the
+    consensus problem (38)-(40) has no solution; the message names the nodes and the numbers.
+    """
+    if scenario.plant.time != "discrete":
+        raise DesignError("lmi needs a discrete plant (time: discrete); its observers are difference equations")
+    progress("decoupling, decomposition and local gain of every node")
+    nodes = {i: _local(scenario, i) for i in scenario.nodes}
+    progress("coupling gains")
+    network = _couple(scenario, nodes)
+    progress("certificate")
+    promises = certificate(scenario, network)
+    specs = {i: _spec(scenario, i, network) for i in nodes}
+    return Design(scenario, plant_spec(scenario), specs, promises)
+
+
+def _local(scenario: Scenario, i: int) -> Local:
+    """Decoupling, decomposition and K_i = D_i K_id of node i."""
+    options: Options = scenario.options
+    C, name, uio = scenario.nodes[i].C, f"node {i}", decouple_node(scenario, i)
+    p = len(C)
+    if uio.margins["output_rank"] <= RTOL:
+        raise DesignError(
+            f"{name}: Assumption 1 fails: its {p} measurements are not independent, rank(C_i) < {p} (least singular "
+            f"value {uio.margins['output_rank']:.2g} with rows of length 1). Replace dependent rows by their mean."
+        )
+    A = uio.P @ scenario.plant.A
+    try:
+        if options.decomposition == "detectability":
+            parts = detectability_decomposition(C, A, stable_radius())
+        else:
+            parts = observability_decomposition(C, A)
+    except GeometryError as e:
+        raise DesignError(f"{name}: no {options.decomposition} decomposition of (P_i A, C_i): {e}") from None
+    D = parts.D
+    system = Subsystem(D.T @ A @ D, C @ D, D.T @ uio.E)  # (14), (15)
+    # As many unknown inputs as measurements: I + C_i E_i = 0, so C_i P_i = 0, and the innovation
+    # (I + C_i E_i) y - C_i xi is zero for ever, because xi(0) = 0. K_i then multiplies nothing, and is 0.
+    inert = uio.basis.shape[1] == p
+    Kd, beta = np.zeros((D.shape[1], p)), None
+    if not inert and options.local_gain == "hinf":
+        Kd, beta = hinf_gain(system, name)
+    elif not inert and options.local_gain == "h2":
+        reached = image(C @ uio.basis)  # measurements that unknown inputs enter carry no innovation
+        Kd = h2_gain(system, complement(reached), noise_covariance(scenario.nodes[i].noise), name)
+    elif not inert and isinstance(options.local_gain, Poles):
+        Kd = placed_gain(system, *options.local_gain.poles, name)
+    if beta is None:
+        beta = worst_gain(system, Kd)
+    # (19) prints K_i = D_i' K_id; the dimensions and (20) need D_i
+    return Local(C, A, uio, parts, D @ Kd, beta, radius(system.A - Kd @ system.C), inert)
+
+
+def _couple(scenario: Scenario, nodes: Mapping[int, Local]) -> Network:
+    """g, island by island: (38) is the maximum over islands, so each may take its own best without raising it."""
+    options: Options = scenario.options
+    ids, laplacian = list(nodes), scenario.graph.laplacian()
+    g: dict[int, float] = {}
+    islands: dict[tuple[int, ...], Coupling] = {}
+    for island in scenario.graph.islands():
+        rows = [ids.index(i) for i in island]
+        parts = [Undetectable(nodes[i].parts.U.T @ nodes[i].A @ nodes[i].parts.U, nodes[i].parts.U) for i in island]
+        found = couple(parts, laplacian[np.ix_(rows, rows)], options.consensus)
+        if not found.beta < 0:  # instead of (40): the sign also says by how much
+            raise DesignError(_infeasible(island, found, nodes, options))
+        islands[island] = found
+        g |= dict(zip(island, map(float, found.g), strict=True))
+    return Network(nodes, {i: g[i] for i in ids}, islands)
+
+
+def _infeasible(island: tuple[int, ...], found: Coupling, nodes: Mapping[int, Local], options: Options) -> str:
+    who = f"node {island[0]}, which hears nobody" if len(island) == 1 else f"nodes {', '.join(map(str, island))}"
+    criterion = "(38)-(39)" if options.consensus == "paper" else "min ||A_u - Theta(g)||_2^2 - 1"
+    dimensions = ", ".join(str(nodes[i].parts.nu) for i in island)
+    advice = ["add edges or measurements", "let nodes know more inputs"]
+    if options.decomposition == "observability":
+        advice.append("try decomposition: detectability, which leaves less to the neighbours")
+    return (
+        f"the consensus design is infeasible: beta_u = {found.beta:+.4f} > 0 on {who} (the least value of {criterion}, "
+        f"lower bound {found.lower:+.4f}; nu = {dimensions}). It asks more than stability: that the sum of |U_i'e_i|^2 "
+        f"falls in every step. To change it: {'; '.join(advice)}; or use method: augmented, whose condition is exact."
+    )
+
+
+def _spec(scenario: Scenario, i: int, network: Network) -> NodeSpec:
+    """The matrices of (16)-(17): N = P A - K C, L of (18), M = P B_i, E, G of (19)."""
+    own = network.nodes[i]
+    E, P, K, U = own.uio.E, own.uio.P, own.K, own.parts.U
+    matrices = {
+        "N": own.A - K @ own.C,
+        "L": K @ (np.eye(len(own.C)) + own.C @ E) - own.A @ E,
+        "M": P @ scenario.known(i),
+        "E": E,
+        "G": network.g[i] * U @ U.T,
+    }
+    return node_spec(scenario, i, matrices)

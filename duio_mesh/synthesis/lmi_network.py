@@ -1,0 +1,151 @@
+"""The coupled observers of seed 000 as one error system (31), and what the design promises about it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy import linalg
+
+from duio_mesh.arrays import Array
+from duio_mesh.errors import DesignError
+from duio_mesh.geometry import RTOL, Decomposition
+from duio_mesh.geometry.subspace import norm
+from duio_mesh.scenario.model import Scenario
+from duio_mesh.synthesis.consensus import Coupling
+from duio_mesh.synthesis.local_gain import radius
+from duio_mesh.synthesis.noise import noise_covariance
+from duio_mesh.synthesis.uio import Decoupling
+
+
+class Local(NamedTuple):
+    """One node before the coupling: (6)-(15), (34)."""
+
+    C: Array  # (p, n)
+    A: Array  # (n, n), P_i A
+    uio: Decoupling
+    parts: Decomposition  # D_i, U_i
+    K: Array  # (n, p), K_i
+    beta: float  # bound (hinf) or value (others) of J_i (33)
+    rho: float  # spectral radius of A_id - K_id C_id
+    inert: bool  # K_i has no effect and is 0
+
+
+class Network(NamedTuple):
+    """All nodes, coupled."""
+
+    nodes: Mapping[int, Local]
+    g: Mapping[int, float]
+    islands: Mapping[tuple[int, ...], Coupling]
+
+    @property
+    def beta(self) -> float:
+        """beta_u of (38)."""
+        return max(island.beta for island in self.islands.values())
+
+
+def error_matrix(scenario: Scenario, network: Network) -> Array:
+    """(N n, N n): e(k+1) = Phi e(k) + ... of all nodes, (31) in the original coordinates.
+
+    Block (i, j) is (P_i A - K_i C_i) [i = j] - g_i l_ij U_i U_i'.
+    """
+    nodes = network.nodes.values()
+    Phi = linalg.block_diag(*[own.A - own.K @ own.C for own in nodes])
+    G = linalg.block_diag(*[g * own.parts.U @ own.parts.U.T for g, own in zip(network.g.values(), nodes, strict=True)])
+    return np.asarray(Phi - G @ np.kron(scenario.graph.laplacian(), np.eye(scenario.plant.n)))
+
+
+def predicted_rms(scenario: Scenario, network: Network, Phi: Array) -> list[float]:
+    """Stationary RMS error per state of each node under the white noise of the file.
+
+    (31) is e(k+1) = Phi e(k) + K v(k) - E v(k+1). With s = e + E v the noise enters once, s(k+1) = Phi s(k) +
+    (K - Phi E) v(k), and cov e = cov s + E V E', because s(k) does not depend on v(k).
+    """
+    nodes = network.nodes.values()
+    V = linalg.block_diag(*[noise_covariance(scenario.nodes[i].noise) for i in network.nodes])
+    E = linalg.block_diag(*[own.uio.E for own in nodes])
+    entry = linalg.block_diag(*[own.K for own in nodes]) - Phi @ E
+    cov = linalg.solve_discrete_lyapunov(Phi, entry @ V @ entry.T) + E @ V @ E.T
+    return [float(np.sqrt(part.mean())) for part in np.split(np.diag(cov), len(network.nodes))]
+
+
+def certificate(scenario: Scenario, network: Network) -> dict[str, Any]:
+    """Plain data. Raises DesignError when a condition of the whole error system does not hold after all."""
+    nodes, islands = network.nodes, network.islands.values()
+    Phi = error_matrix(scenario, network)
+    detectable = max(own.rho for own in nodes.values())
+    undetectable = max(radius(island.phi) for island in islands)
+    rho = radius(Phi)
+    conditions = _conditions(network, rho)
+    failed = [f"{name}: {c['value']:.6g}, needed {c['threshold']:g}" for name, c in conditions.items() if not c["ok"]]
+    if failed:
+        raise DesignError(f"the design does not hold what it should: {'; '.join(failed)}")
+    return {
+        "conditions": conditions,
+        "nodes": _nodes(network, predicted_rms(scenario, network, Phi)),
+        "spectral_radius": rho,
+        "spectral_radius_detectable": detectable,
+        "spectral_radius_undetectable": undetectable,
+        "decomposition": scenario.options.decomposition,
+        "consensus": scenario.options.consensus,
+        "g": list(network.g.values()),
+        "beta_u": network.beta,
+        "beta_u_lower_bound": max(island.lower for island in islands),
+        "norm_phi_u": max(island.norm for island in islands),
+        "rate_bound": float(np.sqrt(max(0.0, 1 + network.beta))),
+        "beta_id": [own.beta for own in nodes.values()],
+    }
+
+
+def _conditions(network: Network, rho: float) -> dict[str, dict[str, Any]]:
+    """What has to hold; rank margins are singular values free of units, of the worst node."""
+    nodes = network.nodes
+    margins = {
+        "Assumption 1, rank C_i": "output_rank",
+        "Assumption 1, rank B_iw": "unknown_input_rank",
+        "Assumption 2, rank C_i B_iw": "decoupling_rank",
+        "(10), rank [P_i; B_iw^+]": "complement_rank",
+    }
+    found = {}
+    for name, key in margins.items():
+        worst = min(nodes, key=lambda i: nodes[i].uio.margins[key])
+        value = nodes[worst].uio.margins[key]
+        found[f"{name} (node {worst})"] = {"value": value, "threshold": RTOL, "ok": value > RTOL}
+    leak = {i: _leak(own) for i, own in nodes.items()}
+    worst = max(leak, key=lambda i: leak[i])
+    found[f"(14)-(15), U_i invariant and unseen (node {worst})"] = _below(leak[worst], 1e-7)
+    worst = max(nodes, key=lambda i: nodes[i].rho)
+    found[f"A_id - K_id C_id is Schur (node {worst})"] = _below(nodes[worst].rho, 1.0)
+    found["(39)-(40), beta_u"] = _below(network.beta, 0.0)
+    found["the error matrix of (31) is Schur"] = _below(rho, 1.0)
+    return found
+
+
+def _below(value: float, threshold: float) -> dict[str, Any]:
+    return {"value": value, "threshold": threshold, "ok": bool(value < threshold)}
+
+
+def _leak(own: Local) -> float:
+    """How far U_i is from being P_i A-invariant and inside ker C_i, relative to the matrices."""
+    D, U = own.parts.D, own.parts.U
+    return max(norm(own.C @ U) / (norm(own.C) or 1.0), norm(D.T @ own.A @ U) / (norm(own.A) or 1.0))
+
+
+def _nodes(network: Network, rms: list[float]) -> dict[int, dict[str, Any]]:
+    return {
+        i: {
+            "unknown_inputs": own.uio.basis.shape[1],
+            "nu": own.parts.nu,
+            "decoupling_margin": own.uio.margins["decoupling_rank"],
+            "output_margin": own.uio.margins["output_rank"],
+            "norm_E": norm(own.uio.E),
+            "norm_K": norm(own.K),
+            "K_is_inert": own.inert,
+            "beta_id": own.beta,
+            "spectral_radius": own.rho,
+            "g": network.g[i],
+            "predicted_rms": predicted,
+        }
+        for (i, own), predicted in zip(network.nodes.items(), rms, strict=True)
+    }

@@ -1,0 +1,188 @@
+"""Output-injection gains of one node's detectable part (seed 000, section 5.2).
+
+    e(k+1) = (A - K C) e(k) + K v(k) - F v(k+1)                                                          (26)
+
+A is A_id (d, d), C is C_id (p, d), F is D_i' E_i (d, p). Everything here makes A - K C Schur or raises DesignError
+with ``node`` as the first word of its text.
+"""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy import linalg
+
+from duio_mesh.arrays import Array
+from duio_mesh.errors import DesignError
+from duio_mesh.geometry import observability_decomposition
+from duio_mesh.geometry.subspace import norm
+
+TOLERANCE = 1e-6
+"""Relative accuracy of the H-infinity bound."""
+
+
+class Subsystem(NamedTuple):
+    """The detectable part of one node."""
+
+    A: Array  # (d, d)
+    C: Array  # (p, d)
+    F: Array  # (d, p)
+
+    @property
+    def stir(self) -> float:
+        """Standard deviation of a small fictitious process noise, per unit of measurement noise.
+
+        Modes that no noise reaches have no best gain (it would tend to a gain that does not stabilise); this gives
+        them one and changes the others by a relative 1e-5.
+        """
+        size = norm(self.C)
+        return 1e-4 * max(norm(self.F), 1 / size if size else 1.0)
+
+
+def radius(M: Array) -> float:
+    """The largest modulus of an eigenvalue; 0 for an empty matrix."""
+    return float(np.abs(np.linalg.eigvals(M)).max(initial=0.0))
+
+
+def worst_gain(system: Subsystem, K: Array) -> float:
+    """J_i of (33): the largest singular value of [v(k); v(k+1)] -> e on a grid of frequencies and at all resonances."""
+    A, C, F = system
+    if not A.size:
+        return 0.0
+    closed = A - K @ C
+    angles = np.concatenate([np.linspace(0, np.pi, 257), np.abs(np.angle(np.linalg.eigvals(closed)))])
+    resolvents = np.exp(1j * angles)[:, None, None] * np.eye(len(A)) - closed
+    inputs = np.hstack([K, -F])
+    responses = np.linalg.solve(resolvents, np.broadcast_to(inputs, (len(angles), *inputs.shape)))
+    return float(np.linalg.norm(responses, 2, axis=(1, 2)).max())
+
+
+def hinf_gain(system: Subsystem, node: str) -> tuple[Array, float]:
+    """K (d, p) with the least beta of (34), and that beta.
+
+    (34) is feasible for beta exactly when the game Riccati equation
+
+        X = F F' + A (X^-1 - I / beta^2 + C'C)^-1 A'
+
+    has a stabilising solution 0 <= X < beta^2 I; then K = A Y C' (I + C Y C')^-1 with Y = (X^-1 - I / beta^2)^-1.
+    Bisection on beta with this test gives the optimum of the semidefinite program (34) itself (the tests compare them),
+    in milliseconds and without the ill-conditioned P of (34). The bound is checked by a frequency sweep.
+    """
+    low = float(np.hypot(norm(system.F), system.stir))  # the answer to an impulse begins with -F, whatever K is
+    start = _central_gain(system, np.inf)
+    if start is None:
+        raise DesignError(
+            f"{node}: no stabilising gain was found for its detectable part (eigenvalues of A_id: "
+            f"{_numbers(np.linalg.eigvals(system.A))}). A mode is too close to being undetectable; "
+            "measure it better, or move decomposition to observability."
+        )
+    high = max(1.01 * worst_gain(system, start), low * (1 + TOLERANCE))
+    K = _central_gain(system, high)
+    while K is None and high < 1e12 * low:
+        high *= 2
+        K = _central_gain(system, high)
+    while K is not None and high > low * (1 + TOLERANCE):
+        beta = max(np.sqrt(low * high), 0.1 * high)
+        better = _central_gain(system, beta)
+        if better is None:
+            low = beta
+        else:
+            high, K = beta, better
+    if K is None or not worst_gain(system, K) <= high * (1 + 1e-4):
+        raise DesignError(
+            f"{node}: the H-infinity gain of its detectable part cannot be computed reliably: the bound found is "
+            f"{high:.6g} and a frequency sweep contradicts it. The numbers are scaled too badly; use local_gain: h2."
+        )
+    return K, high
+
+
+def _central_gain(system: Subsystem, beta: float) -> Array | None:
+    """The K of the Riccati equation for this beta, None when there is no stabilising solution.
+
+    Solved by structured doubling: step k holds the equation's value after 2^k steps of the finite-horizon game.
+    """
+    A, C, F = system
+    I = np.eye(len(A))
+    a, G, X = A.T, C.T @ C - I / beta**2, F @ F.T + system.stir**2 * I
+    try:
+        with np.errstate(all="ignore"):
+            for _ in range(60):
+                W = np.linalg.solve(I + G @ X, np.hstack([a, G]))
+                step = a.T @ X @ W[:, : len(A)]
+                G = _symmetric(G + a @ W[:, len(A) :] @ a.T)
+                a, X = a @ W[:, : len(A)], _symmetric(X + step)
+                if np.linalg.eigvalsh(X)[-1] >= beta**2:
+                    return None
+                if norm(step) <= 1e-14 * norm(X):
+                    break
+            Y = _symmetric(np.linalg.solve(I - X / beta**2, X))
+            K = np.linalg.solve(np.eye(len(C)) + C @ Y @ C.T, C @ Y @ A.T).T
+            closed = A - K @ C
+            balance = F @ F.T + system.stir**2 * I + K @ K.T + closed @ Y @ closed.T
+    except np.linalg.LinAlgError:
+        return None
+    solved = np.linalg.norm(balance - X) <= 1e-5 * np.linalg.norm(X) and np.linalg.eigvalsh(X)[0] >= 0
+    return np.asarray(K, dtype=np.float64) if solved and radius(closed) < 1 else None
+
+
+def h2_gain(system: Subsystem, seen: Array, noise: Array, node: str) -> Array:
+    """K (d, p) with the least stationary trace of cov e under white v(k) with covariance ``noise`` (p, p).
+
+    e = s - F v with s(k+1) = A s - K (C s - (I + C F) v) - A F v, so v(k) enters once: state noise -A F v and
+    measurement noise -(I + C F) v, correlated. s(k) does not depend on v(k), so cov e = cov s + F noise F' and K is the
+    gain of the Kalman predictor for s. I + C F = I + C_i E_i projects onto the measurements that the unknown inputs do
+    not reach directly; the others carry no innovation (C_i xi_i = 0 there), so the filter runs on ``seen``' y, where
+    ``seen`` (p, p - r) is an orthonormal basis of that image. Only the shape of ``noise`` matters; zero counts as I.
+    """
+    A, C, F = system
+    V = noise if noise.any() else np.eye(len(C))
+    V = V + 1e-6 * norm(V) * np.eye(len(C))  # a channel without noise would ask for an infinite gain
+    Cs, AF = seen.T @ C, A @ F
+    Q = _symmetric(AF @ V @ AF.T) + system.stir**2 * norm(V) * np.eye(len(A))
+    S, R = AF @ V @ seen, _symmetric(seen.T @ V @ seen)
+    try:
+        X = linalg.solve_discrete_are(A.T, Cs.T, Q, R, s=S)
+    except (linalg.LinAlgError, ValueError) as e:
+        raise DesignError(f"{node}: the Riccati equation of the H2 gain has no stabilising solution ({e})") from None
+    K: Array = np.linalg.solve(R + Cs @ X @ Cs.T, (A @ X @ Cs.T + S).T).T @ seen.T
+    if not radius(A - K @ C) < 1:
+        raise DesignError(f"{node}: the H2 gain does not stabilise its detectable part numerically")
+    return K
+
+
+def placed_gain(system: Subsystem, low: float, high: float, node: str) -> Array:
+    """K (d, p) that puts the eigenvalues of the observable part of A - K C evenly on [low, high].
+
+    Unobservable modes of the detectable part are stable and stay where they are. The achieved eigenvalues are checked.
+    """
+    from scipy import signal  # 0.6 s, and only this option needs it
+
+    A, C, _ = system
+    D = observability_decomposition(C, A).D
+    wanted = np.linspace(low, high, D.shape[1])
+    if not wanted.size:
+        return np.zeros((len(A), len(C)))
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # about the robustness iteration; the spectrum itself is checked below
+            K = D @ signal.place_poles((D.T @ A @ D).T, (C @ D).T, wanted).gain_matrix.T
+    except ValueError as e:
+        raise DesignError(f"{node}: poles {low:g} to {high:g} cannot be placed: {e}") from None
+    achieved = np.linalg.eigvals(D.T @ (A - K @ C) @ D)
+    error = float(np.abs(np.sort_complex(achieved) - wanted).max())
+    if error > 1e-3:
+        raise DesignError(
+            f"{node}: poles {low:g} to {high:g} are too hard to place: asked for {_numbers(wanted)}, got "
+            f"{_numbers(np.sort_complex(achieved))}. Ask for slower poles, or use local_gain: hinf or h2."
+        )
+    return np.asarray(K)
+
+
+def _symmetric(M: Any) -> Array:
+    return np.asarray((M + M.T) / 2, dtype=np.float64)
+
+
+def _numbers(values: Any) -> str:
+    return ", ".join(f"{v:.4g}" for v in values)
