@@ -86,6 +86,11 @@ def design(scenario: Scenario, progress: Progress) -> Design:
         )
 
     chi = choose_gain("chi", options.chi, growth, rho, h, L)
+    bounds = bounds_21(scenario, nodes)
+    needed = bounds["gamma_needed"]
+    if needed is not None:
+        enough = options.gamma >= needed
+        conditions["gamma"] = {"value": options.gamma, "threshold": f">= {needed:.4g}, or errors stay", "ok": enough}
     certificate = {
         "conditions": conditions,
         "nodes": {i: _facts(node) for i, node in nodes.items()},
@@ -93,7 +98,7 @@ def design(scenario: Scenario, progress: Progress) -> Design:
         "sampled_radius": rho(chi),
         "chi": chi,
         "gamma": options.gamma,
-        **bounds_21(scenario, nodes),
+        **bounds,
         "step": h,
         "largest_step": largest_step(lambda at: rho(chi, at), h),
     }

@@ -109,6 +109,8 @@ def test_bound_21_is_reported(graph, bound):
     assert certificate["chi"] < bound / 4  # and not obeyed
     assert certificate["gamma_needed"] == pytest.approx(0.2 * 2**0.5, abs=1e-9)
     assert certificate["gamma_needed"] < certificate["gamma_bound_21"] < 1
+    assert certificate["conditions"]["gamma"]["ok"]
+    assert not synthesise(on(graph, observer__gamma=0.2)).certificate["conditions"]["gamma"]["ok"]
 
 
 @pytest.mark.parametrize(
