@@ -167,6 +167,11 @@ def test_five_per_cent_lost_messages_still_converge(name):
     assert drive(design, lambda k, i, j: rng.random() < 0.05) < 1e-9
 
 
+def test_the_papers_deadbeat_design_does_not_survive_lost_messages():
+    rng = np.random.default_rng(5)
+    assert drive(noise_free("example9_deadbeat", run__steps=200), lambda k, i, j: rng.random() < 0.05) > 1e3
+
+
 def test_without_messages_the_six_state_errors_do_not_decay():
     """The control of the test above: this system needs its network (the heat ring does not)."""
     assert drive(noise_free("six_state", run__steps=400), lambda k, i, j: True) > 1.0
