@@ -22,7 +22,7 @@ NODE, RING, EDGE = 0.16, 0.23, 0.035  # radii in the topology view, where neighb
 
 def blueprint(entities: Entities, *, rates: bool) -> rrb.Blueprint:
     """Tabs: overview, estimates, what else is reconstructed, the run. ``rates``: whether the recording has any."""
-    tabs = [_overview(entities), _estimates(entities), *_reconstruction(entities), _run(rates)]
+    tabs = [_overview(entities), _estimates(entities), *_reconstruction(entities), _run(entities, rates)]
     return rrb.Blueprint(
         rrb.Tabs(*tabs, active_tab=0),
         rrb.BlueprintPanel(state="collapsed"),
@@ -36,17 +36,16 @@ def blueprint(entities: Entities, *, rates: bool) -> rrb.Blueprint:
 def styles(entities: Entities, description: str) -> Iterator[tuple[str, Any]]:
     """Everything that does not change with time: (entity path, archetype)."""
     yield DESCRIPTION, rr.TextDocument(description, media_type=rr.MediaType.MARKDOWN)
+    yield entities.rate("plant"), _line("plant", TRUTH, 4.0)
     for _, path in entities.truth:
         yield path, _line("truth", TRUTH, 4.0)
     for i in entities.ids:
-        yield entities.error(i), _line(f"node {i}", entities.colours[i], 1.5)
+        for path in (entities.error(i), entities.rate(f"node-{i}")):
+            yield path, _line(f"node {i}", entities.colours[i], 1.5)
         for _, path in entities.estimates(i):
-            own = path.startswith("/noise")
-            single = not own or path.endswith("/v1")  # further noises of one node get the viewer's colours
-            yield (
-                path,
-                _line(path.rsplit("/", 1)[1] if own else f"node {i}", entities.colours[i] if single else None, 1.5),
-            )
+            name = path.rsplit("/", 1)[1] if path.startswith("/noise") else f"node {i}"
+            further = name.startswith("v") and name != "v1"  # noises of one node: the viewer's colours
+            yield path, _line(name, None if further else entities.colours[i], 1.5)
     lanes = rr.StateConfiguration(values=list(STATES), colors=np.array(list(STATES.values()), dtype=np.uint32))
     for who in ("plant", *(f"node-{i}" for i in entities.ids)):
         yield entities.alive(who), lanes
@@ -161,14 +160,12 @@ def _reconstruction(entities: Entities) -> list[rrb.Container]:
     return [rrb.Grid(*views, name="Reconstruction")] if views else []
 
 
-def _run(rates: bool) -> rrb.Container:
+def _run(entities: Entities, rates: bool) -> rrb.Container:
     document = rrb.TextDocumentView(origin=DESCRIPTION, name="What was run")
     if not rates:
         return rrb.Horizontal(document, name="Run")
-    speed = [f"{RATES}/steps", f"{RATES}/rounds"]
-    rest = [f"{RATES}/**", *(f"- {path}" for path in speed)]
-    plots = (_plot("Steps and rounds per second", speed, legend=True), _plot("Frames per second", rest, legend=True))
-    return rrb.Horizontal(rrb.Vertical(*plots), document, name="Run")
+    plot = _plot("Steps per second", [f"{RATES}/**"], legend=len(entities.ids) < LEGEND)
+    return rrb.Horizontal(plot, document, name="Run")
 
 
 def _plot(name: str, contents: list[str], *, legend: bool) -> rrb.View:

@@ -31,8 +31,8 @@ class Conditions:
             self._draw(edge, 0)
 
     def process(self, who: str, state: str, k: int) -> None:
-        """``who`` (plant, node-3) is ``state`` from step k on. That it goes after its last step is no news."""
-        if state == "down" and k >= self._entities.spec.steps:
+        """``who`` (plant, node-3) is ``state`` from step k on. That it goes at its last step is no news."""
+        if state == "down" and k >= self._entities.spec.steps - 1:
             return
         before = self._alive.get(who)
         if before == state:

@@ -58,7 +58,14 @@ class Entities:
 
     def alive(self, who: str) -> str:
         """How a process is: ``who`` is its name, plant or node-3."""
-        return f"/alive/{self.name(int(who.removeprefix('node-'))) if who.startswith('node-') else who}"
+        return f"/alive/{self._process(who)}"
+
+    def rate(self, who: str) -> str:
+        """Steps per second of a process."""
+        return f"{RATES}/{self._process(who)}"
+
+    def _process(self, who: str) -> str:
+        return self.name(int(who.removeprefix("node-"))) if who.startswith("node-") else who
 
     def point(self, i: int) -> str:
         """The node in the topology view."""

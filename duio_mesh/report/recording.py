@@ -15,7 +15,7 @@ from duio_mesh.arrays import Array
 from duio_mesh.report import blueprint as look
 from duio_mesh.report.buffer import ROWS, Buffer
 from duio_mesh.report.conditions import Conditions
-from duio_mesh.report.entities import EVENTS, RATES, Column, Entities
+from duio_mesh.report.entities import EVENTS, Column, Entities
 from duio_mesh.report.pairing import Decimator, Errors, Pairing, Span, Spans, runs
 from duio_mesh.report.streams import Batch, FileStream, LiveStream, Opening
 from duio_mesh.spec import RecorderSpec
@@ -88,7 +88,7 @@ class Recording:
     def liveness(self, who: str | int, state: str, k: int) -> None:
         """How a process (plant, node-3 or the node's id) is from step k on: up, late or down.
 
-        A process that goes after its last step has done its work and is not called down. Repeating a state is no news.
+        A process that goes at its last step has done its work and is not called down. Repeating a state is no news.
         """
         self._conditions.process(who if isinstance(who, str) else f"node-{who}", state, k)
 
@@ -101,9 +101,9 @@ class Recording:
         self._send(EVENTS, [k], rr.TextLog.columns(text=[text], level=[level]))
 
     def rates(self, k: int, values: Mapping[str, float]) -> None:
-        """Rates per second at step k, e.g. ``{"steps": 510.0, "frames": 4080.0}``; about once a second is enough."""
-        for name, value in values.items():
-            self._send(f"{RATES}/{name}", [k], rr.Scalars.columns(scalars=[float(value)]))
+        """Steps per second of processes (plant, node-3) at step k; about once a second is enough."""
+        for who, value in values.items():
+            self._send(self._entities.rate(who), [k], rr.Scalars.columns(scalars=[float(value)]))
 
     def flush(self) -> None:
         """Send what has gathered, where it is enough to be worth it. Call it as often as a viewer should see news."""

@@ -1,0 +1,166 @@
+"""``--plot``: a run as PNG figures, like those in the papers (seed 000, figures 2, 3, 6, 7, 8)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from duio_mesh.arrays import Array
+from duio_mesh.report.entities import palette, spread
+from duio_mesh.report.pairing import Decimator, log_norms
+from duio_mesh.scenario.model import Scenario
+from duio_mesh.trace import Trace
+
+AXES = 12  # nodes or states that one figure shows
+LINES = 16  # lines in one axes
+POINTS = 4000  # of one line; more are thinned to the least and the greatest of every stretch
+DPI = 120
+
+
+def figures(folder: Path, scenario: Scenario, trace: Trace) -> list[Path]:
+    """Draw what the trace has into ``folder``; the files written.
+
+    errors.png (every node's error, one line per state), error_norms.png (log scale, all nodes), states.png,
+    estimates.png (every state with all nodes' estimates), and, where the method reconstructs them,
+    unknown_inputs.png and noise.png. Raises OSError when a file cannot be written.
+    """
+    drawing = _Drawing(folder, scenario, trace)
+    drawing.errors()
+    drawing.error_norms()
+    drawing.states()
+    drawing.estimates()
+    if trace.what is not None:
+        drawing.unknown_inputs(trace.what)
+    if trace.vhat:
+        drawing.noise()
+    return drawing.written
+
+
+class _Drawing:
+    def __init__(self, folder: Path, scenario: Scenario, trace: Trace) -> None:
+        self._folder, self._name, self._trace = folder, scenario.name, trace
+        self._ids = trace.node_ids.tolist()
+        self._colours = {i: _hex(c) for i, c in zip(self._ids, palette(len(self._ids)), strict=True)}
+        self._hours = bool(len(trace.t)) and float(trace.t[-1]) >= 7200
+        self._time = trace.t / 3600 if self._hours else trace.t
+        self.written: list[Path] = []
+
+    def errors(self) -> None:
+        """One axes per node, one line per state: as the papers show them."""
+        states = spread(range(self._trace.x.shape[1]), LINES)
+
+        def draw(axes: Any, i: int) -> None:
+            _distinct(axes, len(states))
+            error = self._trace.xhat[self._ids.index(i)] - self._trace.x
+            for c in states:
+                self._line(axes, error[:, c], label=f"$x_{{{c + 1}}}$", lw=0.9)
+            axes.set(title=f"node {i}", ylabel=rf"$\hat x_{{{i}}} - x$")
+            axes.axhline(0, color="0.6", lw=0.6, zorder=0)
+
+        self._grid("errors.png", "Estimation errors", spread(self._ids, AXES), draw, share=True)
+
+    def error_norms(self) -> None:
+        """All nodes' 2-norms on a log scale."""
+
+        def draw(axes: Any, _: int) -> None:
+            for at, i in enumerate(self._ids):
+                with np.errstate(over="ignore", invalid="ignore"):
+                    norms = log_norms(self._trace.xhat[at] - self._trace.x)
+                self._line(axes, norms, color=self._colours[i], label=f"node {i}", lw=1.1)
+            axes.set(ylabel=r"$\log_{10} \|\hat x_i - x\|_2$")
+
+        self._grid("error_norms.png", "Estimation error norms", [0], draw)
+
+    def states(self) -> None:
+        """The true states in one axes."""
+
+        def draw(axes: Any, _: int) -> None:
+            states = spread(range(self._trace.x.shape[1]), LINES)
+            _distinct(axes, len(states))
+            for c in states:
+                self._line(axes, self._trace.x[:, c], label=f"$x_{{{c + 1}}}$", lw=1.1)
+            axes.set(ylabel="$x$")
+
+        self._grid("states.png", "States of the plant", [0], draw)
+
+    def estimates(self) -> None:
+        """One axes per state: the truth, and what every node thinks of it."""
+        nodes = spread(self._ids, LINES)
+
+        def draw(axes: Any, c: int) -> None:
+            self._line(axes, self._trace.x[:, c], color="0.65", lw=3, label="truth")
+            for i in nodes:
+                own = self._trace.xhat[self._ids.index(i), :, c]
+                self._line(axes, own, color=self._colours[i], lw=0.9, label=f"node {i}")
+            axes.set(title=f"$x_{{{c + 1}}}$")
+
+        self._grid("estimates.png", "States and their estimates", spread(range(self._trace.x.shape[1]), AXES), draw)
+
+    def unknown_inputs(self, what: Array) -> None:
+        """One axes per unknown input, one line per node."""
+
+        def draw(axes: Any, j: int) -> None:
+            for i in spread(self._ids, LINES):
+                own = what[self._ids.index(i), :, j]
+                self._line(axes, own, color=self._colours[i], lw=0.9, label=f"node {i}")
+            axes.set(title=f"$w_{{{j + 1}}}$")
+
+        self._grid("unknown_inputs.png", "Reconstructed unknown inputs", spread(range(what.shape[2]), AXES), draw)
+
+    def noise(self) -> None:
+        """One axes per node, one line per noise."""
+
+        def draw(axes: Any, i: int) -> None:
+            for j in spread(range(self._trace.vhat[i].shape[1]), LINES):
+                self._line(axes, self._trace.vhat[i][:, j], lw=0.9, label=f"$v_{{{j + 1}}}$")
+            axes.set(title=f"node {i}", ylabel=rf"$\hat v_{{{i}}}$")
+
+        self._grid("noise.png", "Reconstructed measurement noise", spread(sorted(self._trace.vhat), AXES), draw)
+
+    def _grid(
+        self, file: str, title: str, items: Sequence[int], draw: Callable[[Any, int], None], *, share: bool = False
+    ) -> None:
+        """One axes per item, drawn by ``draw(axes, item)``, with one legend beside them."""
+        from matplotlib.figure import Figure  # without pyplot: draws into memory, opens no window, changes no setting
+
+        columns = 1 if len(items) == 1 else 2 if len(items) <= 4 else 3
+        rows = -(-len(items) // columns)
+        size = (8.0, 4.5) if len(items) == 1 else (4.2 * columns + 1, 2.5 * rows + 0.6)
+        figure = Figure(figsize=size, layout="constrained")
+        grid = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=share)
+        for axes, item in zip(grid.flat, items, strict=False):
+            draw(axes, item)
+            axes.grid(alpha=0.3)
+            axes.margins(x=0)
+        for axes in grid.flat[len(items) :]:
+            axes.set_visible(False)
+        for column in range(columns):
+            lowest = grid[(len(items) - 1 - column) // columns, column]
+            lowest.set_xlabel("t [h]" if self._hours else "t [s]")
+            lowest.tick_params(labelbottom=True)
+        handles, labels = grid.flat[0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside right upper", frameon=False)
+        figure.suptitle(f"{title}: {self._name}")
+        path = self._folder / file
+        figure.savefig(path, dpi=DPI)
+        self.written.append(path)
+
+    def _line(self, axes: Any, values: Array, **style: Any) -> None:
+        """A line that keeps its spikes however long it is."""
+        thinned = Decimator(-(-2 * len(values) // POINTS))
+        parts = (thinned.push(np.arange(len(values)), values), thinned.drain())
+        steps, kept = (np.concatenate(column) for column in zip(*parts, strict=True))
+        axes.plot(self._time[steps], kept, **style)
+
+
+def _distinct(axes: Any, lines: int) -> None:
+    """Colours that do not repeat, where matplotlib's own ten would."""
+    if lines > 10:
+        axes.set_prop_cycle(color=[_hex(colour) for colour in palette(lines)])
+
+
+def _hex(colour: int) -> str:
+    return f"#{colour >> 8:06x}"
