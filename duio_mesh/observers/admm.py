@@ -17,6 +17,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from duio_mesh.arrays import Array, contiguous
+from duio_mesh.errors import RunError
 from duio_mesh.observers.base import Estimate
 from duio_mesh.observers.fusion import FiniteTimeAverage, Fusion, fusion_rounds, make_fusion
 from duio_mesh.spec import NodeSpec
@@ -30,7 +31,7 @@ class Observer:
 
     def __init__(self, spec: NodeSpec) -> None:
         m, n = spec.matrices, spec.n
-        self._hears, self._options, self._T = spec.hears, spec.options, m["T"]
+        self._id, self._hears, self._options, self._T = spec.id, spec.hears, spec.options, m["T"]
         self._local = contiguous(np.hstack([m["Abar"], -m["PL"], m["PB"]]))
         states = m["Abar"].shape[0]
         self._own = np.zeros(states + spec.p + spec.m)  # [s; y; u], written in place
@@ -72,12 +73,18 @@ class Observer:
         return self._fusion.message(r - self._ahead)
 
     def exchange(self, r: int, received: Mapping[int, Array]) -> None:
-        """The next iterate from the neighbours' present ones."""
+        """The next iterate from the neighbours' present ones. Raises RunError when one is missing in a set-up round."""
         if self._fusion is not None:
             if self.on_round is not None:
                 self._tell(self.on_round, r, self._fusion.state, received)
             self._fusion.exchange(r - self._ahead, received)
             return
+        silent = sorted(self._hears.keys() - received.keys())
+        if silent:
+            raise RunError(
+                f"node {self._id}: no message from node(s) {silent} in round {r} of the set-up, which needs every one; "
+                "where messages get lost, let the launcher find H (observer.setup: global)"
+            )
         self._setup.exchange(r, received)
         if r + 1 == self._ahead:
             self._finish_setup()

@@ -97,9 +97,8 @@ def _relaxed(island: Island, options: Options) -> Iterator[Array]:
 
 def _relaxed_solve(island: Island, c: float) -> Array:
     """(N, n, n): the inverses of H^-1 T_i'T_i + c d_i I."""
-    own: Array = island.curvatures(normalised=True) + c * island.degrees[:, None, None] * np.eye(len(island.H))
-    inverses: Array = np.linalg.inv(own)
-    return inverses
+    own = island.curvatures(normalised=True) + c * island.degrees[:, None, None] * np.eye(len(island.H))
+    return np.asarray(np.linalg.inv(own), dtype=np.float64)
 
 
 def worst_error(X: Array) -> float:
