@@ -18,7 +18,7 @@ def load_scenario(path: str | Path, **overrides: Any) -> Scenario:
 
     Raises ScenarioError with one line per problem, each with file:line:column.
     """
-    pairs = [f"{name}={json.dumps(value)}" for name, value in overrides.items()]
+    pairs = [f"{name}={json.dumps(value, ensure_ascii=False)}" for name, value in overrides.items()]
     return scenario.load_scenario(path, pairs, options_of=synthesis.options_of)
 
 

@@ -20,11 +20,12 @@ import numpy as np
 
 from duio_mesh.arrays import Array
 from duio_mesh.errors import RunError
+from duio_mesh.report.description import describe
 from duio_mesh.report.metrics import metrics
 from duio_mesh.report.trace_file import write_trace
 from duio_mesh.run_folder import RunFolder
 from duio_mesh.scenario.model import Scenario
-from duio_mesh.simulation import Trace, estimate_sizes, simulate
+from duio_mesh.simulation import Trace, estimate_sizes, reconstructs, simulate
 from duio_mesh.spec import NodeSpec, PlantSpec, RecorderSpec, Wire, write_spec
 from duio_mesh.supervisor import Supervisor
 from duio_mesh.synthesis.design import Design
@@ -94,9 +95,10 @@ class Launch:
                 steps=design.plant.steps,
                 recording=str(folder.root / "recording.rrd"),
                 live=self._live,
-                description=design.scenario.description,
+                description=describe(design.scenario, design.certificate),
                 truth=str(folder.rows("plant")),
                 estimates={i: str(folder.rows(f"node-{i}")) for i in ids},
+                unknown_inputs=reconstructs(design)[0],
                 # it dials everybody, so that nobody has to wait for it or misses it
                 wire=Wire(run, (), (plant, *(at[i] for i in ids))),
             )
@@ -208,7 +210,7 @@ def run_in_process(
 
 def write_inputs(folder: RunFolder, design: Design) -> None:
     """scenario.yaml and certificate.json."""
-    (folder.root / "scenario.yaml").write_text(resolved(design.scenario))
+    (folder.root / "scenario.yaml").write_text(resolved(design.scenario), encoding="utf-8")
     (folder.root / "certificate.json").write_text(json.dumps(design.certificate, indent=2) + "\n")
 
 
@@ -256,7 +258,7 @@ def _finish(
     if record:
         from duio_mesh.report.record_trace import record_trace
 
-        record_trace(folder.root / "recording.rrd", design.scenario, trace)
+        record_trace(folder.root / "recording.rrd", design.scenario, trace, describe(design.scenario, design.certificate))
     report = metrics(trace, design.scenario, counts)
     (folder.root / "metrics.json").write_text(json.dumps(report, indent=2) + "\n")
     folder.tidy()

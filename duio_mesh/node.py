@@ -15,22 +15,23 @@ import numpy as np
 from duio_mesh.errors import RunError
 from duio_mesh.journal import Journal
 from duio_mesh.mesh import Mesh
-from duio_mesh.mesh.lockstep import ONE_ROUND, Exchange, Line, Lockstep
+from duio_mesh.mesh.lockstep import Exchange, Line, Lockstep
 from duio_mesh.observers import make_observer
 from duio_mesh.process import Report, main
 from duio_mesh.spec import NodeSpec
 
 NO_VECTOR = np.zeros(0)
+BEAT = 0.5  # seconds between signs of life inside a step
 
 
 def run(spec: NodeSpec, report: Report) -> None:
     """Run one node for ``spec.steps`` steps. Raises RunError when a neighbour or the plant is lost or late."""
-    i, p = spec.id, spec.p
+    i, p, window = spec.id, spec.p, spec.window
     observer = make_observer(spec)
     with Mesh(spec.wire, f"node-{i}", report.warn) as mesh:
         keys = mesh.keys
-        plant = Line(mesh, keys.plant(i), f"plant -> {i}", "plant", ("plant", i), spec.window)
-        heard = {j: Line(mesh, keys.edge(j, i), f"edge {j} -> {i}", f"node-{j}", (j, i), ONE_ROUND) for j in spec.hears}
+        plant = Line(mesh, keys.plant(i), f"plant -> {i}", "plant", ("plant", i), window)
+        heard = {j: Line(mesh, keys.edge(j, i), f"edge {j} -> {i}", f"node-{j}", (j, i), window) for j in spec.hears}
         told = mesh.speak([(keys.edge(i, j), f"edge {i} -> {j}", (i, j)) for j in spec.tells])
         credit = mesh.speak([(keys.credit(i), f"{i} -> plant", (i, "plant"))])
         trace = mesh.speak([(keys.trace(i), f"{i} -> recorder", None)], drop=True)
@@ -42,6 +43,7 @@ def run(spec: NodeSpec, report: Report) -> None:
         row = sum(part.size for part in observer.estimate())
         zeros = np.zeros(spec.n)
         rounds, begin = 0, time.monotonic()
+        beat = begin + BEAT
         with lockstep, Journal(spec.output, row, trace) as journal:
             for k in range(spec.steps):
                 sample = lockstep.take(plant, k, 0, p + spec.m)
@@ -49,6 +51,10 @@ def run(spec: NodeSpec, report: Report) -> None:
                 for r in range(observer.rounds):
                     observer.exchange(r, exchange(k, r, observer.message(r)))
                     rounds += 1
+                    if (now := time.monotonic()) > beat:  # a step of many rounds may last longer than any deadline
+                        beat = now + BEAT
+                        credit.send(k, 0, NO_VECTOR)
+                        report.beat()
                 estimate = observer.estimate()
                 if not isfinite(zeros.dot(estimate.state)):
                     raise RunError(f"node-{i}: the estimate overflowed at step {k}; is the plant unstable?")

@@ -7,6 +7,7 @@ output. Ends: 0 done, 3 failed (the reason is the last event), 143 asked to stop
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import os
 import signal
@@ -37,14 +38,19 @@ class Report:
 
     def __call__(self, event: str, **fields: Any) -> None:
         """Report ``event``; a launcher that is gone is not an error here (the process is about to be ended)."""
-        line = json.dumps({"who": self._who, "event": event, **fields}) + "\n"
         if self._log:
-            self._log.write(json.dumps({"time": round(time.time(), 6)})[:-1] + ", " + line[1:])
+            self._log.write(json.dumps({"time": round(time.time(), 6), "event": event, **fields}) + "\n")
             self._log.flush()
-        try:
-            os.write(self._fd, line.encode()[:4096])  # at most PIPE_BUF: lines of several processes do not mix
-        except BrokenPipeError:
-            return
+        self._say({"event": event, **fields})
+
+    def _say(self, event: dict[str, Any]) -> None:
+        with contextlib.suppress(BrokenPipeError):
+            os.write(self._fd, json.dumps({"who": self._who, **event}).encode() + b"\n")
+
+    def beat(self) -> None:
+        """Show the launcher that things move, though no step may be finished for long. Not an event, not logged."""
+        if self._log:
+            self._say({"event": "beat"})
 
     def warn(self, text: str) -> None:
         """Report something odd that does not end the process."""

@@ -58,6 +58,7 @@ class Supervisor:
     def __init__(self) -> None:
         """Start the nursery; it gets ready by itself while the caller goes on."""
         self.processes: dict[str, Process] = {}
+        self._beats = 0  # whatever anybody says shows that things move
         self._status, write = os.pipe()
         self._control, theirs = socket.socketpair()
         environment = os.environ | dict.fromkeys(THREADS, "1")
@@ -105,13 +106,13 @@ class Supervisor:
         ``look`` is called ten times a second, shows the progress and returns a number that grows with it.
         Raises RunError naming the process, or the edge, step and round that a process reported.
         """
-        seen, since = -1, time.monotonic()
+        seen, since = (-1, 0), time.monotonic()
         while not all(p.code == 0 for p in self._essential()):
             self._listen(FRAME)
             if any(p.failure or p.code for p in self._essential()):
                 self._until(lambda: False, GATHER)
                 raise RunError(self._diagnosis())
-            if (now := look()) != seen:
+            if (now := (look(), self._beats)) != seen:
                 seen, since = now, time.monotonic()
             elif time.monotonic() - since > self._allowed(deadline):
                 stuck = ", ".join(p.who for p in self._essential() if not p.done)
@@ -174,6 +175,7 @@ class Supervisor:
 
     def _hear(self, event: dict[str, Any]) -> None:
         process, what = self.processes[event["who"]], event["event"]
+        self._beats += 1
         if what == "ready":
             process.said = event
         elif what == "done":

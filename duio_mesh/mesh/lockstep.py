@@ -24,20 +24,25 @@ from duio_mesh.errors import RunError
 from duio_mesh.mesh.frames import FLOAT64, RESIDUE, TAIL, Decoder, Rejected, prefix, stamp
 from duio_mesh.mesh.session import Mesh, Outlet, Ready, Source
 
+ROOM = 4  # frames per step of the window that may wait
 TICK = 0.1  # seconds between the watchdog's looks
-ONE_ROUND = 2  # frames: a neighbour can be one round ahead, because its next round needs our present one
 
 
 class Line(Source):
     """One incoming link of a node."""
 
-    def __init__(self, mesh: Mesh, key: str, name: str, who: str, ready: Ready, capacity: int) -> None:
-        """``capacity``: frames that may wait in the channel; beyond it the sender feels it."""
+    def __init__(self, mesh: Mesh, key: str, name: str, who: str, ready: Ready, window: int) -> None:
+        """``window``: steps that the sender may be ahead of us.
+
+        A neighbour that hears us is never more than a round ahead, because its next round needs our present one. One
+        that does not hear us (a directed edge) is held back only by its own neighbours and by the plant's window. The
+        channel has room for that: a full one would hold up everything else that this process receives.
+        """
         super().__init__(name, who, Decoder(mesh.keys.run, who))
         self.prefix = prefix(mesh.keys.run, who)
         self.waiting: dict[tuple[int, int], Array] = {}  # good frames that are not due yet
-        self.capacity = capacity
-        self._subscriber = mesh.subscribe(key, zenoh.handlers.FifoChannel(capacity), ready)
+        self.window = window
+        self._subscriber = mesh.subscribe(key, zenoh.handlers.FifoChannel(ROOM * window), ready)
         self._closed = False
         self.receive = self._subscriber.handler.recv
         mesh.sources.append(self)
@@ -113,7 +118,7 @@ class Lockstep:
             return
         if frame[:2] < (k, r) or frame[:2] in line.waiting:
             self._mesh.reject(line, "seen before")
-        elif frame.k - k > line.capacity or (frame.k == k and frame.r - r > 1) or (frame.k > k and frame.r > 1):
+        elif frame.k - k > line.window or len(line.waiting) >= ROOM * line.window:
             self._mesh.reject(line, "too far ahead")
         else:
             line.waiting[frame[:2]] = frame.vector

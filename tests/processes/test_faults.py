@@ -13,7 +13,7 @@ from tests.processes.running import Running
 
 pytestmark = [pytest.mark.mesh, pytest.mark.usefixtures("nothing_left")]
 
-TOPOLOGY = "augmented_heat_ring.yaml"
+TOPOLOGY = "ring.yaml"
 ENDING = 5.0  # seconds that an end may take
 SLACK = 5.0  # for a loaded machine
 
