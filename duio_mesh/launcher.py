@@ -258,7 +258,8 @@ def _finish(
     if record:
         from duio_mesh.report.record_trace import record_trace
 
-        record_trace(folder.root / "recording.rrd", design.scenario, trace, describe(design.scenario, design.certificate))
+        page = describe(design.scenario, design.certificate)
+        record_trace(folder.root / "recording.rrd", design.scenario, trace, page)
     report = metrics(trace, design.scenario, counts)
     (folder.root / "metrics.json").write_text(json.dumps(report, indent=2) + "\n")
     folder.tidy()

@@ -31,7 +31,7 @@ class Rates:
         now = time.monotonic()
         if (passed := now - self._at) < RATE_PERIOD:
             return
-        rates = {f"{who} steps": (k - self._seen.get(who, 0)) / passed for who, k in newest.items()}
+        rates = {who: (k - self._seen.get(who, 0)) / passed for who, k in newest.items()}
         self._recording.rates(max(0, max(newest.values()) - 1), rates)
         self._at, self._seen = now, dict(newest)
 

@@ -40,7 +40,7 @@ def simulate(design: Design, progress: Callable[[int], None] = lambda _: None) -
 def split_trace(design: Design, x: Array, rows: dict[int, Array]) -> Trace:
     """Cut every node's rows [x-hat | w-hat | v-hat] (K, size) into the named arrays of a trace."""
     n, ids = design.scenario.plant.n, sorted(rows)
-    q, r = _reconstructs(design)
+    q, r = reconstructs(design)
     xhat = np.stack([rows[i][:, :n] for i in ids])
     return Trace(
         t=np.arange(x.shape[0], dtype=np.float64) * design.plant.step,
@@ -52,7 +52,7 @@ def split_trace(design: Design, x: Array, rows: dict[int, Array]) -> Trace:
     )
 
 
-def _reconstructs(design: Design) -> tuple[int, dict[int, int]]:
+def reconstructs(design: Design) -> tuple[int, dict[int, int]]:
     """(q, {node: r_i}) that the method's estimates carry beside the state."""
     sizes = {i: make_observer(spec).estimate() for i, spec in design.nodes.items()}
     return max(e.unknown_input.size for e in sizes.values()), {i: e.noise.size for i, e in sizes.items()}

@@ -56,6 +56,7 @@ class Recording:
         enough = _enough(entities.state_values, entities.series, CHUNKS * 3 // 4)
         self._states = {source: Buffer(paths[source], enough, self._scalars) for source in paths}
 
+        self.event(f"{len(entities.ids)} nodes, {spec.n} states, {spec.steps} steps of {spec.step:g} s")
         self._conditions = Conditions(entities, self._send, self.event)
 
     @property
@@ -140,7 +141,10 @@ class Recording:
         self._closed = True
         for i, decimator in self._thinned.items():
             self._errors[i].add(*_column(*decimator.drain()))
-        for source, gaps in self.missing().items():
+        missing = self.missing()
+        if not missing:
+            self.event("complete: every step of every node is here", "INFO", self._spec.steps - 1)
+        for source, gaps in missing.items():
             who = "the truth" if source is None else f"node {source}"
             spans = ", ".join(f"{a} to {b - 1}" for a, b in gaps[:8]) + (", ..." if len(gaps) > 8 else "")
             self.event(f"not in the recording: {who}, steps {spans}", "WARN", gaps[-1][1] - 1)
