@@ -19,10 +19,15 @@ class Conditions:
         entities: Entities,
         send: Callable[[str, Sequence[int], Any], None],
         event: Callable[[str, str, int], None],
+        reached: Callable[[str], int],
     ) -> None:
-        """``send(path, steps, columns)`` and ``event(text, level, step)`` write into the recording."""
-        self._entities, self._send, self._event = entities, send, event
+        """``send(path, steps, columns)`` and ``event(text, level, step)`` write into the recording.
+
+        ``reached(who)`` is the step after the last that a process has given.
+        """
+        self._entities, self._send, self._event, self._reached = entities, send, event, reached
         self._alive: dict[str, str] = {}
+        self._leaving: dict[str, tuple[int, int]] = {}  # who -> (down from which step, how far it had come)
         self._told: dict[tuple[int, int], str] = {}  # arc -> what was last said of it
         self._drawn: dict[tuple[int, int], str] = {}  # edge -> how it is drawn
         for i in entities.ids:
@@ -31,9 +36,41 @@ class Conditions:
             self._draw(edge, 0)
 
     def process(self, who: str, state: str, k: int) -> None:
-        """``who`` (plant, node-3) is ``state`` from step k on. That it goes at its last step is no news."""
-        if state == "down" and k >= self._entities.spec.steps - 1:
+        """``who`` (plant, node-3) is ``state`` from step k on; down is believed later, by ``settle``."""
+        if state == "down":
+            self._leaving[who] = (k, self._reached(who))
             return
+        if who in self._leaving:  # gone and back before anybody could tell
+            self._gone(who)
+        self._change(who, state, k)
+
+    def settle(self, *, finally_: bool = False) -> None:
+        """Call down who has gone and from whom nothing has come since the last call; ``finally_``: all who have gone.
+
+        A process that gave its last step has done its work; its last rows may come after the news that it went.
+        """
+        for who, (k, reached) in list(self._leaving.items()):
+            now = self._reached(who)
+            if finally_ or now == reached:
+                self._gone(who)
+            else:
+                self._leaving[who] = (k, now)
+
+    def arc(self, i: int, j: int, state: str, k: int) -> None:
+        """The arc on which i tells j is ``state`` from step k on. Raises KeyError when there is none."""
+        if (i, j) not in self._entities.spec.arcs:
+            raise KeyError(f"node {i} does not tell node {j}")
+        if self._told.get((i, j), "up") != state:
+            self._event(f"edge {i} to {j} is {state}" + (" again" if state == "up" else ""), LEVELS[state], k)
+        self._told[i, j] = state
+        self._draw((min(i, j), max(i, j)), k)
+
+    def _gone(self, who: str) -> None:
+        k, _ = self._leaving.pop(who)
+        if self._reached(who) < self._entities.spec.steps:
+            self._change(who, "down", k)
+
+    def _change(self, who: str, state: str, k: int) -> None:
         before = self._alive.get(who)
         if before == state:
             return
@@ -47,15 +84,6 @@ class Conditions:
             for edge in self._entities.edges:
                 if i in edge:
                     self._draw(edge, k)
-
-    def arc(self, i: int, j: int, state: str, k: int) -> None:
-        """The arc on which i tells j is ``state`` from step k on. Raises KeyError when there is none."""
-        if (i, j) not in self._entities.spec.arcs:
-            raise KeyError(f"node {i} does not tell node {j}")
-        if self._told.get((i, j), "up") != state:
-            self._event(f"edge {i} to {j} is {state}" + (" again" if state == "up" else ""), LEVELS[state], k)
-        self._told[i, j] = state
-        self._draw((min(i, j), max(i, j)), k)
 
     def _draw(self, edge: tuple[int, int], k: int) -> None:
         """An edge looks as bad as its worse end, or as what was last said of one of its directions."""

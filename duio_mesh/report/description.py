@@ -17,8 +17,8 @@ def describe(scenario: Scenario, certificate: Mapping[str, Any]) -> str:
         f"# {scenario.name}",
         scenario.description,
         "",
-        f"Method **{scenario.method}**, {len(scenario.nodes)} nodes, {plant.n} states, {plant.B.shape[1]} inputs, "
-        f"{plant.E.shape[1]} disturbances. {plant.time.capitalize()} plant, {plant.step:g} s a step, "
+        f"Method **{scenario.method}**; nodes {len(scenario.nodes)}, states {plant.n}, inputs {plant.B.shape[1]}, "
+        f"disturbances {plant.E.shape[1]}. {plant.time.capitalize()} plant, {plant.step:g} s a step, "
         f"{run.steps} steps, seed {run.seed}.",
         "",
         f"Converged means: every node's RMS error per state over the last {run.convergence.over_last:.0%} of the run "

@@ -57,7 +57,7 @@ class Recording:
         self._states = {source: Buffer(paths[source], enough, self._scalars) for source in paths}
 
         self.event(f"{len(entities.ids)} nodes, {spec.n} states, {spec.steps} steps of {spec.step:g} s")
-        self._conditions = Conditions(entities, self._send, self.event)
+        self._conditions = Conditions(entities, self._send, self.event, self._reached)
 
     @property
     def url(self) -> str | None:
@@ -89,7 +89,8 @@ class Recording:
     def liveness(self, who: str | int, state: str, k: int) -> None:
         """How a process (plant, node-3 or the node's id) is from step k on: up, late or down.
 
-        A process that goes at its last step has done its work and is not called down. Repeating a state is no news.
+        A process that goes is not called down before its rows have stopped coming (they may be on their way still),
+        and never when its last step is here: then it has done its work. Repeating a state is no news.
         """
         self._conditions.process(who if isinstance(who, str) else f"node-{who}", state, k)
 
@@ -108,6 +109,7 @@ class Recording:
 
     def flush(self) -> None:
         """Send what has gathered, where it is enough to be worth it. Call it as often as a viewer should see news."""
+        self._conditions.settle()
         for buffer in self._buffers():
             buffer.flush()
 
@@ -139,6 +141,7 @@ class Recording:
         if self._closed:
             return
         self._closed = True
+        self._conditions.settle(finally_=True)
         for i, decimator in self._thinned.items():
             self._errors[i].add(*_column(*decimator.drain()))
         missing = self.missing()
@@ -183,6 +186,11 @@ class Recording:
     def _say(self, errors: Errors) -> None:
         steps, values = self._thinned[errors.node].push(errors.steps, errors.log10)
         self._errors[errors.node].add(*_column(steps, values))
+
+    def _reached(self, who: str) -> int:
+        """The step after the last that a process has given."""
+        seen = self._seen[int(who.removeprefix("node-")) if who.startswith("node-") else None]
+        return max((last for _, last in seen), default=0)
 
     def _break_lines(self) -> None:
         """A NaN at the start of every gap between two rows: a viewer would join the rows with a line."""
