@@ -121,7 +121,7 @@ def _central_gain(system: Subsystem, beta: float) -> Array | None:
             K = np.linalg.solve(np.eye(len(C)) + C @ Y @ C.T, C @ Y @ A.T).T
             closed = A - K @ C
             balance = F @ F.T + system.stir**2 * I + K @ K.T + closed @ Y @ closed.T
-    except np.linalg.LinAlgError:
+    except (np.linalg.LinAlgError, ValueError):  # singular, or no longer finite
         return None
     solved = norm(balance - X) <= 1e-5 * norm(X) and radius(closed) < 1
     return _array(K) if solved and worst_gain(system, _array(K)) <= beta * (1 + TOLERANCE) else None

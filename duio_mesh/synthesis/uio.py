@@ -13,6 +13,9 @@ from duio_mesh.errors import DesignError
 from duio_mesh.geometry.subspace import RTOL, image, rank, unit_columns, unit_rows
 from duio_mesh.scenario.model import Scenario
 
+ROUNDING = 1e-13
+"""A row of C or column of B̄ this much shorter than the longest is a rounding error, not a quantity in large units."""
+
 
 class Decoupling(NamedTuple):
     """What takes the unknown inputs out of one node's error, and how far its ranks are from failing."""
@@ -39,10 +42,10 @@ def decouple(C: Array, Bbar: Array, node: str = "a node", unknown: Sequence[str]
     Source: seed 000, (6)-(10) with H_i = 0.
     """
     p, n = C.shape
-    columns = unit_columns(Bbar)
+    columns = unit_columns(Bbar, ROUNDING)
     basis = image(columns)
     r = basis.shape[1]
-    rows = unit_rows(C)
+    rows = unit_rows(C, ROUNDING)
     seen = np.linalg.svd(rows @ basis, compute_uv=False)
     if np.sum(seen > RTOL) < r:
         raise DesignError(_cannot_decouple(seen, p, r, node, unknown))

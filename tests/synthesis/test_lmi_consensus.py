@@ -1,0 +1,113 @@
+"""Coupling gains against the literal semidefinite programs and the paper's numbers."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import linalg
+
+from duio_mesh.synthesis.consensus import Undetectable, couple
+from duio_mesh.synthesis.eigenvalue import Pencil, minimise_largest_eigenvalue
+
+
+def random_network(seed, m=4, n=4, directed=False):
+    rng = np.random.default_rng(seed)
+    W = rng.uniform(0.2, 3.0, (m, m)) * (rng.random((m, m)) < 0.7)
+    np.fill_diagonal(W, 0)
+    if not directed:
+        W = np.triu(W) + np.triu(W).T
+    A = rng.standard_normal((n, n))
+    A *= 1.05 / np.linalg.norm(A, 2)
+    parts = []
+    for _ in range(m):
+        U = np.linalg.qr(rng.standard_normal((n, n)))[0][:, : rng.integers(1, n)]
+        parts.append(Undetectable(U.T @ A @ U, U))
+    return parts, np.diag(W.sum(axis=1)) - W
+
+
+def literal(parts, laplacian, criterion):
+    """(38)-(39), or the least norm of A_u - Theta(g), with Theta of (42) written as it is printed."""
+    import cvxpy as cp
+
+    n, m = parts[0].U.shape[0], len(parts)
+    U, Au = linalg.block_diag(*[p.U for p in parts]), linalg.block_diag(*[p.A for p in parts])
+    g, beta, I = cp.Variable(m), cp.Variable(), np.eye(len(Au))
+    Theta = sum(g[i] * (U.T @ np.kron(np.diag(np.eye(m)[i]) @ laplacian, np.eye(n)) @ U) for i in range(m))
+    if criterion == "norm":
+        problem = cp.Problem(cp.Minimize(cp.sigma_max(Au - Theta)))
+        problem.solve(solver="CLARABEL")
+        return g.value, problem.value**2 - 1
+    M11 = Au.T @ Au - Au.T @ Theta - (Au.T @ Theta).T - I
+    M = cp.bmat([[M11, Theta.T], [Theta, -I]])
+    cp.Problem(cp.Minimize(beta), [beta * np.eye(2 * len(Au)) - (M + M.T) / 2 >> 0]).solve(solver="CLARABEL")
+    return g.value, float(beta.value)
+
+
+@pytest.mark.parametrize("criterion", ["paper", "norm"])
+@pytest.mark.parametrize(("seed", "directed"), [(0, False), (1, True), (2, False)])
+def test_is_the_optimum_of_the_semidefinite_program(seed, directed, criterion):
+    parts, laplacian = random_network(seed, directed=directed)
+    found = couple(parts, laplacian, criterion)
+    _, beta = literal(parts, laplacian, criterion)
+    assert found.beta == pytest.approx(beta, abs=1e-6)
+    assert found.lower <= found.beta <= found.lower + 1e-6
+
+
+def test_the_certificate_is_a_true_bound_and_phi_is_30():
+    parts, laplacian = random_network(3, directed=True)
+    found = couple(parts, laplacian, "norm")
+    U, Au = linalg.block_diag(*[p.U for p in parts]), linalg.block_diag(*[p.A for p in parts])
+
+    def phi(g):
+        return Au - U.T @ np.kron(np.diag(g) @ laplacian, np.eye(4)) @ U
+
+    np.testing.assert_allclose(found.phi, phi(found.g), atol=1e-12)
+    assert found.norm == pytest.approx(np.linalg.norm(found.phi, 2))
+    assert found.beta == pytest.approx(found.norm**2 - 1, abs=1e-8)
+    rng = np.random.default_rng(0)
+    for size in (1e-3, 1e-2, 0.1, 1.0):
+        for _ in range(50):
+            g = found.g + size * rng.standard_normal(4)
+            assert np.linalg.norm(phi(g), 2) ** 2 - 1 >= found.lower
+
+
+def test_39_is_conservative_where_it_is_feasible():
+    parts, laplacian = random_network(0)
+    shrunk = [Undetectable(0.8 * p.A, p.U) for p in parts]
+    paper, norm = couple(shrunk, laplacian, "paper"), couple(shrunk, laplacian, "norm")
+    assert norm.beta < paper.beta < 0
+    assert paper.norm**2 - 1 <= paper.beta
+
+
+def test_a_lone_node_and_nodes_without_an_undetectable_part():
+    U = np.eye(3)[:, :2]
+    alone = couple([Undetectable(np.diag([0.5, -0.8]), U)], np.zeros((1, 1)), "norm")
+    assert alone.g == 0
+    assert alone.beta == pytest.approx(0.8**2 - 1)
+    nothing = Undetectable(np.zeros((0, 0)), np.zeros((3, 0)))
+    edge = np.array([[1.0, -1.0], [-1.0, 1.0]])
+    both = couple([nothing, nothing], edge, "paper")
+    assert (both.beta, both.norm, both.phi.shape) == (-1.0, 0.0, (0, 0))
+    one = couple([Undetectable(np.diag([1.2, 1.1]), U), nothing], edge, "norm")
+    assert one.g[1] == 0
+    assert one.g[0] == pytest.approx(1.15)  # |1.2 - g| = |1.1 - g|
+    assert one.beta == pytest.approx(0.05**2 - 1)
+
+
+def test_least_largest_eigenvalue_in_closed_form():
+    # lambda_max of [[1 + 2x, 0, 0], [0, 3 - 2x, 0], [0, 0, -5]] is least, 2, at x = 1/2
+    pencil = Pencil(np.diag([1.0, 3.0, -5.0]), np.eye(3)[:, :2], np.diag([1.0, -1.0, 0.0])[:, :2], (2,))
+    found = minimise_largest_eigenvalue(pencil)
+    assert found.x[0] == pytest.approx(0.5, abs=1e-6)
+    assert found.value == pytest.approx(2.0, abs=1e-7)
+    assert found.lower <= 2.0 + 1e-12
+
+
+def test_scales_far_apart():
+    """Weights of 1000 and 0.001, as a user's graph may have them: only g changes, by the inverse factor."""
+    parts, laplacian = random_network(2)
+    base = couple(parts, laplacian, "norm")
+    for factor in (1e3, 1e-3):
+        scaled = couple(parts, factor * laplacian, "norm")
+        assert scaled.beta == pytest.approx(base.beta, abs=1e-6)
+        np.testing.assert_allclose(scaled.g * factor, base.g, rtol=1e-3)
