@@ -14,7 +14,7 @@ import numpy as np
 from duio_mesh.arrays import Array
 from duio_mesh.errors import DesignError
 from duio_mesh.geometry import RTOL, Stability, detectability_decomposition, stable_radius
-from duio_mesh.scenario.model import Noise, Scenario
+from duio_mesh.scenario.model import Scenario
 from duio_mesh.spec import NodeSpec
 from duio_mesh.synthesis.augmented_error import (
     ErrorSystem,
@@ -30,6 +30,7 @@ from duio_mesh.synthesis.augmented_existence import View, check
 from duio_mesh.synthesis.augmented_gains import find_gains, given_H
 from duio_mesh.synthesis.augmented_options import BraschPearson, Options
 from duio_mesh.synthesis.design import Design, Progress, node_spec, plant_spec
+from duio_mesh.synthesis.noise import noise_covariance
 from duio_mesh.synthesis.uio import decouple_node
 
 __all__ = ["Options", "design"]
@@ -76,14 +77,6 @@ def design(scenario: Scenario, progress: Progress) -> Design:
         for i, sensor, own in zip(scenario.nodes, network.sensors, gains, strict=True)
     }
     return Design(scenario, plant_spec(scenario), specs, certificate)
-
-
-def noise_covariance(noise: Noise) -> Array:
-    """(p, p): covariance of the white part (``normal`` terms) of v_i as it enters y_i."""
-    variances = [
-        sum(p["std"] ** 2 for term in s for kind, p in term.items() if kind == "normal") for s in noise.signals
-    ]
-    return np.asarray(noise.channel * np.array(variances, dtype=np.float64) @ noise.channel.T)
 
 
 def _network(scenario: Scenario, options: Options) -> tuple[Network, dict[int, View], dict[int, float]]:

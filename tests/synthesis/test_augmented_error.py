@@ -10,8 +10,8 @@ from scipy import linalg
 
 from duio_mesh import load_scenario, simulate, synthesise
 from duio_mesh.scenario.model import Noise
-from duio_mesh.synthesis.augmented import noise_covariance
 from duio_mesh.synthesis.augmented_error import distance_to_instability, gramians, spectral_radius, transient
+from duio_mesh.synthesis.noise import noise_covariance
 
 TOPOLOGIES = Path(__file__).parents[2] / "topologies"
 
