@@ -149,8 +149,8 @@ class Relaxed:
 
         (H^-1 T_i'T_i + c d_i I) x_i = H^-1 T_i'xi_i + c sum_j a_ij x_j.
 
-    Its fixed point is x when every xi_i = T_i x, whatever was lost, late or repeated on the way; with noise it is off
-    by about c times the noise. A value that never came counts as zero.
+    Its fixed point is x when every xi_i = T_i x, whatever was lost, late or repeated on the way. With noise the nodes
+    end apart and noisier than least squares, the more so the smaller c is. A value that never came counts as zero.
     """
 
     def __init__(

@@ -16,7 +16,15 @@ from duio_mesh.scenario.model import Scenario
 from duio_mesh.spec import NodeSpec
 from duio_mesh.synthesis.admm_local import LEAST_CURVATURE, Local, check_joint, facts, local_estimates, noise_gain
 from duio_mesh.synthesis.admm_options import Options
-from duio_mesh.synthesis.admm_rates import Island, fusion_radius, island_facts, iterates, spectrum, worst_error
+from duio_mesh.synthesis.admm_rates import (
+    Island,
+    fused_maps,
+    fusion_radius,
+    island_facts,
+    iterates,
+    spectrum,
+    worst_error,
+)
 from duio_mesh.synthesis.design import Design, Progress, node_spec, plant_spec
 
 __all__ = ["Options", "design"]
@@ -40,16 +48,17 @@ def design(scenario: Scenario, progress: Progress) -> Design:
     for ids in scenario.graph.islands():
         progress(f"fusion of nodes {list(ids)}")
         eigenvalues = check_joint(ids, nodes, stability)
-        island = _island(scenario, ids, nodes)
+        island = island_of(scenario, ids, nodes)
         radius = _converges(island, options)
-        gains = noise_gain((nodes[i] for i in ids), island.inverse)
+        gains = noise_gain((nodes[i] for i in ids), fused_maps(island, options))
         described.append(island_facts(island, options, eigenvalues, radius, gains))
         islands |= dict.fromkeys(ids, island)
     specs = {i: _spec(scenario, i, local, islands[i]) for i, local in nodes.items()}
     return Design(scenario, plant_spec(scenario), specs, _certificate(options, nodes, islands, described))
 
 
-def _island(scenario: Scenario, ids: tuple[int, ...], nodes: Mapping[int, Local]) -> Island:
+def island_of(scenario: Scenario, ids: tuple[int, ...], nodes: Mapping[int, Local]) -> Island:
+    """The fusion problem of one connected component. Raises DesignError when an edge works one way only."""
     graph = scenario.graph
     at = [graph.ids.index(i) for i in ids]
     L = graph.laplacian()[np.ix_(at, at)]

@@ -121,16 +121,18 @@ def _plain(values: NDArray[np.complex128]) -> list[list[float]]:
     return [[float(v.real), float(v.imag)] for v in values]
 
 
-def noise_gain(nodes: Iterable[Local], inverse: Array) -> Array:
-    """(n,) standard deviation of the exactly fused estimate's error per unit of white noise on every measurement.
+def noise_gain(nodes: Iterable[Local], maps: Array) -> Array:
+    """(n,) the worst node's standard deviation of x-hat - x per unit of white noise on every measurement.
 
-    The local error obeys e+ = Abar e - P L v, and [e_i; v_i] reaches the estimate through H^-1 T_i'.
+    ``maps`` (., n, r) take the stacked xi = [s_1; y_1; s_2; ...] to estimates; see ``fused_maps``. The local error
+    obeys e+ = Abar e - P L v, so xi - T x has the covariance of e beside that of v.
     """
-    covariance = np.zeros_like(inverse)
+    blocks = []
     for local in nodes:
         f = local.filter
         drive = f.P @ f.L
         own = linalg.solve_discrete_lyapunov(f.Abar, drive @ drive.T) if len(f.Abar) else f.Abar
-        G = inverse @ local.T.T
-        covariance += G @ linalg.block_diag(own, np.eye(f.L.shape[1])) @ G.T
-    return np.sqrt(np.diag(covariance))
+        blocks += [own, np.eye(f.L.shape[1])]
+    covariance = linalg.block_diag(*blocks)
+    variances: Array = np.einsum("kab,bc,kac->ka", maps, covariance, maps)
+    return np.asarray(np.sqrt(variances.max(axis=0)))

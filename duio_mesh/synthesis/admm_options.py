@@ -33,7 +33,7 @@ class Options(Strict):
     alpha_factor: PositiveFloat = 1.0
     """admm: times the step size (16). Above 1 no theorem holds; the iteration's spectral radius is checked."""
     c: PositiveFloat = 0.01
-    """relaxed: pull towards the neighbours. Small is fast; noise moves the result by about c times the noise."""
+    """relaxed: pull towards the neighbours. Small is fast; with noise only a large one is near the best estimate."""
     rounds: Rounds = 80
     """relaxed: exchanges per step."""
     setup: Literal["global", "distributed"] = "global"

@@ -7,6 +7,7 @@ from itertools import islice
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy import linalg
 
 from duio_mesh.arrays import Array
 from duio_mesh.geometry import complement
@@ -111,6 +112,21 @@ def predicted_errors(island: Island, options: Options, rounds: int) -> dict[int,
     wanted = sorted({0, 1, 2, 5, 10, 20, 30, 40, 50, 60, 80, 100, 200, 500, 1000, 3000, 10000, rounds})
     kept = [k for k in wanted if k <= rounds]
     return {k: worst_error(X) for k, X in enumerate(islice(iterates(island, options), rounds + 1)) if k in set(kept)}
+
+
+def fused_maps(island: Island, options: Options) -> Array:
+    """(k, n, sum of r_i): what the fusion ends in, as a map from all stacked xi_i; k = 1 where all nodes agree.
+
+    H^-1 [T_1' T_2' ...], the least-squares solution (12), for admm and finite_time; relaxed nodes agree only on
+    consistent xi.
+    """
+    pull = [island.inverse @ T.T for T in island.T]
+    if options.fusion != "relaxed":
+        return np.hstack(pull)[None]
+    n, N = len(island.H), len(island.T)
+    own = linalg.block_diag(*(G @ T for G, T in zip(pull, island.T, strict=True)))
+    end = np.linalg.solve(own + options.c * np.kron(island.L, np.eye(n)), linalg.block_diag(*pull))
+    return np.asarray(end).reshape(N, n, -1)
 
 
 def fusion_radius(island: Island, options: Options) -> float:

@@ -178,6 +178,17 @@ def test_a_node_that_needs_nobody(fusion: str) -> None:
     assert worst(simulate(design)) < 1e-12
 
 
+def test_poles_go_where_they_can_be_placed() -> None:
+    """A node that sees everything and knows one input places all four eigenvalues that the others leave it."""
+    node = {1: {"C": np.eye(6).tolist(), "knows": ["ua"]}}
+    common = {"nodes": node, "graph__edges": []}
+    design = designed("admm_ring.yaml", observer__poles=[0.1, -0.2, 0.3, 0.4, 0.5], **common)
+    placed = design.certificate["nodes"][1]["local_eigenvalues"]
+    assert sorted(v[0] for v in placed) == pytest.approx([-0.2, 0.1, 0.3, 0.4], abs=1e-6)
+    with pytest.raises(DesignError, match="node 1: no local estimate.*4 poles can be placed on X/W but only 1"):
+        designed("admm_ring.yaml", observer__poles=[0.1], **common)
+
+
 def test_relaxed_fusion_survives_loss() -> None:
     """20 % of all messages on the ring never arrive, independently: below 1e-6 in every step all the same."""
     design = designed("relaxed_ring.yaml", run__steps=50)

@@ -13,7 +13,7 @@ import pytest
 from scipy import linalg
 
 from duio_mesh import Design, Trace, load_scenario, simulate, synthesise
-from duio_mesh.synthesis.admm import _island
+from duio_mesh.synthesis.admm import island_of
 from duio_mesh.synthesis.admm_local import local_estimates
 from duio_mesh.synthesis.admm_options import Options
 from duio_mesh.synthesis.admm_rates import Island, theorem_bound
@@ -37,7 +37,7 @@ def ring(**overrides: object) -> Design:
 @cache
 def island(graph: str) -> Island:
     scenario = load_scenario(TOPOLOGIES / "admm_ring.yaml", **{"graph.edges": GRAPHS[graph]})
-    return _island(scenario, (1, 2, 3, 4), local_estimates(scenario, scenario.options))
+    return island_of(scenario, (1, 2, 3, 4), local_estimates(scenario, scenario.options))
 
 
 class Stacked:
@@ -190,14 +190,17 @@ def test_the_mean_of_the_iterates_is_a_bad_output() -> None:
     assert mean > 1e4 * oracle.worst(100)
 
 
-def test_noise_gain_of_the_notes_and_against_a_simulation() -> None:
-    """Standard deviation of the fused error per unit of white measurement noise; x5 is hopeless (131)."""
-    design = synthesise(load_scenario(TOPOLOGIES / "finite_time_ring.yaml", **{"plant.noise": {"std": 1e-3}}))
-    gain = np.array(design.certificate["islands"][0]["noise_gain"])
-    assert gain == pytest.approx([1.0, 0.72, 3.4, 0.34, 131, 1.1], rel=0.05)
-    longer = synthesise(
-        load_scenario(TOPOLOGIES / "finite_time_ring.yaml", **{"plant.noise": {"std": 1e-3}, "run.steps": 6000})
-    )
-    trace = simulate(longer)
-    measured = (trace.xhat[0] - trace.x)[1000:].std(axis=0) / 1e-3
-    assert measured == pytest.approx(gain, rel=0.15)
+def test_noise_gain_of_the_notes() -> None:
+    """Standard deviation of the fused error per unit of white measurement noise; x5 is hopeless."""
+    assert ring().certificate["islands"][0]["noise_gain"] == pytest.approx([1.0, 0.72, 3.4, 0.34, 131, 1.1], rel=0.05)
+
+
+@pytest.mark.parametrize(("name", "c"), [("finite_time_ring.yaml", None), ("relaxed_ring.yaml", 0.1)])
+def test_noise_gain_against_a_simulation(name: str, c: float | None) -> None:
+    noisy: dict = {"plant.noise": {"std": 1e-3}, "run.steps": 6000 if c is None else 1500}
+    if c is not None:
+        noisy |= {"observer.c": c, "observer.rounds": 20}
+    design = synthesise(load_scenario(TOPOLOGIES / name, **noisy))
+    trace = simulate(design)
+    measured = (trace.xhat - trace.x)[:, 500:].std(axis=1).max(axis=0) / 1e-3
+    assert measured == pytest.approx(design.certificate["islands"][0]["noise_gain"], rel=0.25)
