@@ -185,7 +185,7 @@ def test_poles_go_where_they_can_be_placed() -> None:
     design = designed("admm_ring.yaml", observer__poles=[0.1, -0.2, 0.3, 0.4, 0.5], **common)
     placed = design.certificate["nodes"][1]["local_eigenvalues"]
     assert sorted(v[0] for v in placed) == pytest.approx([-0.2, 0.1, 0.3, 0.4], abs=1e-6)
-    with pytest.raises(DesignError, match="node 1: no local estimate.*4 poles can be placed on X/W but only 1"):
+    with pytest.raises(DesignError, match=r"node 1: no local estimate.*4 poles can be placed on X/W but only 1"):
         designed("admm_ring.yaml", observer__poles=[0.1], **common)
 
 

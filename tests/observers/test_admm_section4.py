@@ -197,9 +197,9 @@ def test_noise_gain_of_the_notes() -> None:
 
 @pytest.mark.parametrize(("name", "c"), [("finite_time_ring.yaml", None), ("relaxed_ring.yaml", 0.1)])
 def test_noise_gain_against_a_simulation(name: str, c: float | None) -> None:
-    noisy: dict = {"plant.noise": {"std": 1e-3}, "run.steps": 6000 if c is None else 1500}
+    noisy: dict = {"plant.noise": {"std": 1e-3}, "run.steps": 6000 if c is None else 2000}
     if c is not None:
-        noisy |= {"observer.c": c, "observer.rounds": 20}
+        noisy |= {"observer.c": c, "observer.rounds": 45}
     design = synthesise(load_scenario(TOPOLOGIES / name, **noisy))
     trace = simulate(design)
     measured = (trace.xhat - trace.x)[:, 500:].std(axis=1).max(axis=0) / 1e-3
