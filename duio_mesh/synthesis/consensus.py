@@ -73,11 +73,11 @@ def _pencil(Au: Array, theta: Array, own: NDArray[np.bool_], sizes: tuple[int, .
     """The matrix whose largest eigenvalue is beta_u (paper: M_g of (41)) or ||Phi_u||_2 (norm).
 
     With P_i = [-A_u' J_i; J_i] and Q_i = [T_i'; 0] the sum of g_i (P_i Q_i' + Q_i P_i') is [[-A_u'Theta - Theta'A_u,
-    Theta'], [Theta, 0]]; with P_i = [0; -J_i] it is [[0, -Theta'], [-Theta, 0]].
+    Theta'], [Theta, 0]]; with P_i = [0; -J_i] it is [[0, -Theta'], [-Theta, 0]]. Q's zero rows are not stored.
     """
     N = len(Au)
     I, J, zero = np.eye(N), np.eye(N)[:, own], np.zeros((N, N))
-    Q = np.vstack([theta[own].T, np.zeros((N, J.shape[1]))])
+    Q = theta[own].T
     if criterion == "paper":
         return Pencil(linalg.block_diag(Au.T @ Au - I, -I), np.vstack([-Au.T @ J, J]), Q, sizes)
     return Pencil(np.block([[zero, Au.T], [Au, zero]]), np.vstack([0 * J, -J]), Q, sizes)

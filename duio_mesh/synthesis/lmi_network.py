@@ -143,7 +143,7 @@ def _nodes(network: Network, rms: list[float]) -> dict[int, dict[str, Any]]:
             "norm_K": norm(own.K),
             "K_is_inert": own.inert,
             "beta_id": own.beta,
-            "spectral_radius": own.rho,
+            "local_spectral_radius": own.rho,
             "g": network.g[i],
             "predicted_rms": predicted,
         }

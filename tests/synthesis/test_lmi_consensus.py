@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy import linalg
 
+from duio_mesh.errors import DesignError
 from duio_mesh.synthesis.consensus import Undetectable, couple
 from duio_mesh.synthesis.eigenvalue import Pencil, minimise_largest_eigenvalue
 
@@ -111,3 +112,17 @@ def test_scales_far_apart():
         scaled = couple(parts, factor * laplacian, "norm")
         assert scaled.beta == pytest.approx(base.beta, abs=1e-6)
         np.testing.assert_allclose(scaled.g * factor, base.g, rtol=1e-3)
+
+
+def test_a_badly_followed_path_is_noticed(monkeypatch):
+    """With absurd barrier steps the result is either right or refused; the certificate must not be fooled."""
+    parts, laplacian = random_network(0)
+    right = couple(parts, laplacian, "paper").beta
+    refused = 0
+    for factor in (1e3, 1e5, 1e7, 1e9):
+        monkeypatch.setattr("duio_mesh.synthesis.eigenvalue.FACTOR", factor)
+        try:
+            assert couple(parts, laplacian, "paper").beta == pytest.approx(right, abs=1e-6)
+        except DesignError:
+            refused += 1
+    assert refused
