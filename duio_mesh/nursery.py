@@ -30,12 +30,14 @@ from duio_mesh.process import Report, live
 from duio_mesh.spec import NodeSpec, PlantSpec, RecorderSpec
 
 GRACE = 3.0  # seconds between asking a process to stop and making it
+RECORDER_NICE = 10  # it may take what the mesh leaves of the processor; what it misses it reads at the end
 _PR_SET_PDEATHSIG = 1
 
 
 def _run_recorder(spec: RecorderSpec, report: Report) -> None:
     from duio_mesh import recorder  # imports rerun: 90 MB that the nodes must not share
 
+    os.nice(RECORDER_NICE)
     recorder.run(spec, report)
 
 

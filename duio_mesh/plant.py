@@ -9,6 +9,9 @@ from __future__ import annotations
 import time
 from queue import Empty
 
+import numpy as np
+
+from duio_mesh.arrays import Array
 from duio_mesh.dynamics import Plant
 from duio_mesh.errors import RunError
 from duio_mesh.journal import Journal
@@ -74,13 +77,18 @@ def run(spec: PlantSpec, report: Report) -> None:
         report("ready")
         credits, begin = Credits(mesh, nodes, spec), time.monotonic()
         with Journal(spec.output, plant.x.size, truth) as journal:
-            for k in range(spec.steps):
+            for k in range(0, spec.steps, spec.block):
+                block = range(k, min(k + spec.block, spec.steps))
                 credits.collect()
-                credits.wait(k + 1 - spec.window)
-                for i, data in plant.sample().items():
-                    samples[i].send(k, 0, data)
-                journal.add((plant.x,))
-                plant.advance()
+                credits.wait(block.stop - spec.window)
+                rows: dict[int, list[Array]] = {i: [] for i in ids}
+                for _ in block:
+                    for i, data in plant.sample().items():
+                        rows[i].append(data)
+                    journal.add((plant.x,))
+                    plant.advance()
+                for i, outlet in samples.items():
+                    outlet.send(k, 0, np.array(rows[i]))
             journal.flush()
             credits.wait(spec.steps)
         frames = sum(outlet.frames for outlet in samples.values())

@@ -73,7 +73,7 @@ def run(spec: RecorderSpec, report: Report) -> None:
         recording.fill(
             map_rows(spec.truth, spec.n), {i: map_rows(path, spec.sizes[i]) for i, path in spec.estimates.items()}
         )
-    report("done", rejected=mesh.rejections())
+    report("done", cpu_seconds=time.process_time(), rejected=mesh.rejections())
 
 
 def _keep(recording: Recording, spec: RecorderSpec, node: int | None, frame: Frame) -> int:

@@ -52,6 +52,7 @@ class NodeSpec:
     deadline: float  # seconds to wait for any one message
     window: int  # steps that the plant may be ahead of the slowest node
     credit: int  # report progress to the plant every this many steps
+    block: int  # steps whose samples the plant sends in one frame
     output: str = ""  # file of this node's own estimates, float64 rows; "" keeps none
     wire: Wire = UNWIRED
 
@@ -82,6 +83,7 @@ class PlantSpec:
     seed: int
     steps: int
     window: int  # steps it may be ahead of the slowest node
+    block: int  # steps whose samples travel in one frame
     deadline: float
     recorded: bool = False  # there is a recorder to wait for, a little
     output: str = ""  # file of the true state, float64 rows

@@ -56,6 +56,11 @@ def _config(wire: Wire) -> zenoh.Config:
     return config
 
 
+def _at_once(callback: Callable[[Any], None]) -> Any:
+    """Call back on Zenoh's own thread. The plain form would start a thread of its own for every subscriber."""
+    return zenoh.handlers.Callback(callback, indirect=False)
+
+
 class Source:
     """One incoming key: who sends on it, what it has sent, and what of it was refused."""
 
@@ -137,14 +142,14 @@ class Mesh:
         source = Source(name, who, Decoder(self.keys.run, who))
         self.sources.append(source)
         put = self._queue.put
-        self.subscribe(key, lambda sample: put((source, sample.payload.to_bytes())), ready)
+        self.subscribe(key, _at_once(lambda sample: put((source, sample.payload.to_bytes()))), ready)
         return source
 
     def subscribe(self, key: str, handler: Any, ready: Ready | None) -> Any:
         """A Zenoh subscriber that lives as long as the mesh; ``ready`` announces it to the start barrier."""
         self._kept.append(subscriber := self._session.declare_subscriber(key, handler))
         if ready:  # after the data subscriber, on the same link: whoever sees this one can be heard
-            self._kept.append(self._session.declare_subscriber(self.keys.ready(*ready), lambda _: None))
+            self._kept.append(self._session.declare_subscriber(self.keys.ready(*ready), zenoh.handlers.FifoChannel(1)))
         return subscriber
 
     def speak(self, links: Iterable[tuple[str, str, Ready | None]], drop: bool = False) -> Outlet:
@@ -173,7 +178,7 @@ class Mesh:
                 put((who, None))
 
         everyone = self.keys.alive("*")
-        self._kept.append(self._session.liveliness().declare_subscriber(everyone, seen, history=True))
+        self._kept.append(self._session.liveliness().declare_subscriber(everyone, _at_once(seen), history=True))
 
     # -- the start barrier ------------------------------------------------------------------------------------------
 
@@ -191,9 +196,8 @@ class Mesh:
         matched: set[str] = set()
         news = SimpleQueue[str]()
         for name, publisher in meeting.items():
-            self._kept.append(
-                publisher.declare_matching_listener(lambda s, name=name: news.put(name) if s.matching else None)
-            )
+            told = _at_once(lambda status, name=name: news.put(name) if status.matching else None)
+            self._kept.append(publisher.declare_matching_listener(told))
             if publisher.matching_status.matching:
                 news.put(name)
         end = time.monotonic() + timeout

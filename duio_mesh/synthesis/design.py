@@ -46,8 +46,14 @@ def node_spec(
         steps=run.steps,
         deadline=run.deadline,
         window=run.window,
-        credit=max(1, run.window // 4),
+        credit=_quarter(run.window),
+        block=_quarter(run.window),
     )
+
+
+def _quarter(window: int) -> int:
+    """Steps between two words from node to plant, and in one frame from plant to node: few enough to keep both busy."""
+    return max(1, window // 4)
 
 
 def plant_spec(scenario: Scenario) -> PlantSpec:
@@ -83,6 +89,7 @@ def plant_spec(scenario: Scenario) -> PlantSpec:
         seed=run.seed,
         steps=run.steps,
         window=run.window,
+        block=_quarter(run.window),
         deadline=run.deadline,
     )
 
