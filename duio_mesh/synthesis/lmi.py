@@ -19,7 +19,6 @@ from duio_mesh.geometry import (
     observability_decomposition,
     stable_radius,
 )
-from duio_mesh.geometry.subspace import complement, image
 from duio_mesh.scenario.model import Scenario
 from duio_mesh.scenario.strict import Strict
 from duio_mesh.spec import NodeSpec
@@ -103,8 +102,9 @@ def _local(scenario: Scenario, i: int) -> Local:
     if not inert and options.local_gain == "hinf":
         Kd, beta = hinf_gain(system, name)
     elif not inert and options.local_gain == "h2":
-        reached = image(C @ uio.basis)  # measurements that unknown inputs enter carry no innovation
-        Kd = h2_gain(system, complement(reached), noise_covariance(scenario.nodes[i].noise), name)
+        # measurements that unknown inputs enter carry no innovation: the filter sees the complement of im C_i B_iw
+        seen = np.linalg.qr(C @ uio.basis, mode="complete")[0][:, uio.basis.shape[1] :]
+        Kd = h2_gain(system, seen, noise_covariance(scenario.nodes[i].noise), name)
     elif not inert and isinstance(options.local_gain, Poles):
         Kd = placed_gain(system, *options.local_gain.poles, name)
     if beta is None:
@@ -138,8 +138,8 @@ def _infeasible(island: tuple[int, ...], found: Coupling, nodes: Mapping[int, Lo
     if options.decomposition == "observability":
         advice.append("try decomposition: detectability, which leaves less to the neighbours")
     return (
-        f"the consensus design is infeasible: beta_u = {found.beta:+.4f} > 0 on {who} (the least value of {criterion}, "
-        f"lower bound {found.lower:+.4f}; nu = {dimensions}). It asks more than stability: that the sum of |U_i'e_i|^2 "
+        f"the consensus design is infeasible: beta_u = {found.beta:+.3g} > 0 on {who} (the least value of {criterion}, "
+        f"lower bound {found.lower:+.3g}; nu = {dimensions}). It asks more than stability: that the sum of |U_i'e_i|^2 "
         f"falls in every step. To change it: {'; '.join(advice)}; or use method: augmented, whose condition is exact."
     )
 
