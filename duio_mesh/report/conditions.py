@@ -44,14 +44,14 @@ class Conditions:
             self._gone(who)
         self._change(who, state, k)
 
-    def settle(self, *, finally_: bool = False) -> None:
-        """Call down who has gone and from whom nothing has come since the last call; ``finally_``: all who have gone.
+    def settle(self, *, final: bool = False) -> None:
+        """Call down who has gone and from whom nothing has come since the last call; ``final``: all who have gone.
 
         A process that gave its last step has done its work; its last rows may come after the news that it went.
         """
         for who, (k, reached) in list(self._leaving.items()):
             now = self._reached(who)
-            if finally_ or now == reached:
+            if final or now == reached:
                 self._gone(who)
             else:
                 self._leaving[who] = (k, now)

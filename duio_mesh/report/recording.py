@@ -108,10 +108,14 @@ class Recording:
             self._send(self._entities.rate(who), [k], rr.Scalars.columns(scalars=[float(value)]))
 
     def flush(self) -> None:
-        """Send what has gathered, where it is enough to be worth it. Call it as often as a viewer should see news."""
+        """Write what has gathered, where it is enough to be worth it. Call it as often as a viewer should see news.
+
+        What is written survives a kill. Raises OSError when the disk would not take it.
+        """
         self._conditions.settle()
         for buffer in self._buffers():
             buffer.flush()
+        self._file.flush()
 
     def missing(self) -> dict[int | None, list[Span]]:
         """Steps (first, last + 1) whose rows or errors are not in the recording, by node; None is the truth."""
@@ -141,7 +145,7 @@ class Recording:
         if self._closed:
             return
         self._closed = True
-        self._conditions.settle(finally_=True)
+        self._conditions.settle(final=True)
         for i, decimator in self._thinned.items():
             self._errors[i].add(*_column(*decimator.drain()))
         missing = self.missing()
@@ -189,7 +193,7 @@ class Recording:
 
     def _reached(self, who: str) -> int:
         """The step after the last that a process has given."""
-        seen = self._seen[int(who.removeprefix("node-")) if who.startswith("node-") else None]
+        seen = self._seen[None if who == "plant" else int(who.removeprefix("node-"))]
         return max((last for _, last in seen), default=0)
 
     def _break_lines(self) -> None:

@@ -79,11 +79,12 @@ class Opening:
 
 
 class FileStream:
-    """recording.rrd. Every batch is on its way to the disk when ``send`` returns; a kill loses nothing sent before."""
+    """recording.rrd. A kill loses at most what was sent after the last ``flush``."""
 
     def __init__(self, path: Path, opening: Opening) -> None:
         """Raises OSError when the file cannot be created."""
         self._path, self._opening = path, opening
+        self._unwritten = True
         self._stream = opening.stream()
         try:
             opening.begin(self._stream, rr.FileSink(path))
@@ -91,15 +92,24 @@ class FileStream:
             raise OSError(f"cannot record to {path}: {e}") from None
 
     def send(self, batch: Batch) -> None:
-        """Write one batch."""
+        """Pass a batch to the thread that writes."""
+        self._unwritten = True
         self._opening.send(self._stream, batch)
 
-    def close(self) -> None:
-        """Write what is left, and the footer. Raises OSError when something could not be written (a full disk)."""
+    def flush(self) -> None:
+        """Wait until everything is with the operating system. Raises OSError when it would not take it."""
+        if not self._unwritten:
+            return
         try:
             self._stream.flush(timeout_sec=WRITE)
         except RuntimeError as e:
             raise OSError(f"{self._path} is incomplete: {e}") from None
+        self._unwritten = False
+
+    def close(self) -> None:
+        """Write what is left, and the footer. Raises OSError when that is impossible (a full disk)."""
+        try:
+            self.flush()
         finally:
             self._stream.disconnect()
 
