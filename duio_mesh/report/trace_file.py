@@ -37,7 +37,7 @@ def read_trace(path: Path) -> Trace:
     Raises ValueError when the file is not a trace, OSError when it cannot be read.
     """
     try:
-        with np.load(path, allow_pickle=False) as arrays:
+        with path.open("rb") as f, np.load(f, allow_pickle=False) as arrays:
             named = {name: arrays[name] for name in arrays.files}
         trace = Trace(
             t=named.pop("t"),
