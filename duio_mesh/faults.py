@@ -81,6 +81,10 @@ class Faults:
         return Incoming(target, self.seed, {s: rules for (s, t), rules in sorted(self.links.items()) if t == target})
 
 
+NO_FAULTS = Faults()
+UNDISTURBED = Incoming()
+
+
 class Fate(NamedTuple):
     """What happens to one frame. One that is lost or corrupt does not arrive, whatever else is said of it."""
 

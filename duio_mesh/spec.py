@@ -17,6 +17,7 @@ import msgpack
 import numpy as np
 
 from duio_mesh.arrays import Array, contiguous
+from duio_mesh.faults import UNDISTURBED, Incoming, Rule
 
 START = 30.0  # seconds for all processes of a run to find each other
 
@@ -53,6 +54,7 @@ class NodeSpec:
     window: int  # steps that the plant may be ahead of the slowest node
     credit: int  # report progress to the plant every this many steps
     block: int  # steps whose samples the plant sends in one frame
+    batch: int  # steps between two exchanges: 1, or as many as the observer fuses at once
     output: str = ""  # file of this node's own estimates, float64 rows; "" keeps none
     wire: Wire = UNWIRED
 
@@ -111,7 +113,9 @@ class RecorderSpec:
 
 Spec = TypeVar("Spec", NodeSpec, PlantSpec, RecorderSpec)
 
-_TYPES: dict[str, type[Any]] = {t.__name__: t for t in (Wire, NodeSpec, SensorSpec, PlantSpec, RecorderSpec)}
+_TYPES: dict[str, type[Any]] = {
+    t.__name__: t for t in (Wire, Rule, Incoming, NodeSpec, SensorSpec, PlantSpec, RecorderSpec)
+}
 _ARRAY, _RECORD = 1, 2  # msgpack extension codes
 
 

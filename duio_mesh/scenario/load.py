@@ -11,6 +11,7 @@ from pydantic import BaseModel
 
 from duio_mesh.methods import METHODS
 from duio_mesh.scenario import model, schema
+from duio_mesh.scenario.disturbed import read_faults
 from duio_mesh.scenario.network import read_graph, read_nodes
 from duio_mesh.scenario.overrides import apply_override
 from duio_mesh.scenario.plant import PLANT, PlantParts, read_plant
@@ -66,13 +67,14 @@ def _scenario(document: dict[str, Any], problems: Problems, options_of: OptionsO
     graph = read_graph(document["graph"], nodes, problems) if "graph" in document else None
     method, options = _observer(document["observer"], problems, options_of) if "observer" in document else ("", None)
     settings = _run(run, len(nodes or ()) * (parts.states.number if parts.states else 0), problems)
+    faults = read_faults(document.get("faults"), graph, run.get("seed", 0), problems)
     if problems or parts.plant is None or nodes is None or graph is None or settings is None:
         return None
     resolved = copy.deepcopy(document)
     resolved["run"]["seed"] = settings.seed
     sound = {i: node for i, node in nodes.items() if node is not None}
     return model.Scenario(
-        heading["name"], heading["description"], parts.plant, method, options, sound, graph, settings, resolved
+        heading["name"], heading["description"], parts.plant, method, options, sound, graph, settings, resolved, faults
     )
 
 
@@ -117,4 +119,4 @@ def _run(run: dict[str, Any], numbers: int, problems: Problems) -> model.Run | N
     if not schema.Run.model_fields.keys() <= run.keys():
         return None
     verdict = model.Convergence(**run["convergence"].model_dump())
-    return model.Run(run["steps"], run["seed"], verdict, run["deadline"], run["window"])
+    return model.Run(run["steps"], run["seed"], verdict, run["deadline"], run["window"], run["batch"])

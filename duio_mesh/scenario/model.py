@@ -12,6 +12,7 @@ from typing import Any, Literal, NamedTuple, TypeAlias
 import numpy as np
 
 from duio_mesh.arrays import Array
+from duio_mesh.faults import NO_FAULTS, Faults
 
 Signal: TypeAlias = tuple[Mapping[str, Mapping[str, float]], ...]
 """A sum of terms, each ``{kind: parameters}``; ``duio_mesh.dynamics.signal`` evaluates it. () is zero."""
@@ -150,6 +151,7 @@ class Run:
     convergence: Convergence
     deadline: float  # seconds a process waits for a message before the run fails
     window: int  # steps that the plant may be ahead of the slowest node
+    batch: int = 1  # steps whose fusion travels as one block; estimates then come that many steps late
 
 
 @dataclass(frozen=True)
@@ -165,6 +167,7 @@ class Scenario:
     graph: Graph
     run: Run
     document: Mapping[str, Any] = field(repr=False)  # the resolved file as plain data: what scenario.yaml is made of
+    faults: Faults = NO_FAULTS
 
     def known(self, i: int) -> Array:
         """B_i (n, m_i): columns of B whose inputs node i is told, in the order of ``plant.inputs``."""

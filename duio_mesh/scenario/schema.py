@@ -11,10 +11,11 @@ from typing import Annotated, Any, ClassVar, Literal, TypeAlias
 from pydantic import ConfigDict, Field, model_validator
 from pydantic_core import PydanticCustomError
 
+from duio_mesh.faults import MAX_DELAY
 from duio_mesh.scenario.problems import listed
 from duio_mesh.scenario.strict import Strict
 
-RESERVED = dict.fromkeys(("faults", "timing", "security", "hosts"), "is reserved for a later version of duio_mesh")
+RESERVED = dict.fromkeys(("timing", "security", "hosts"), "is reserved for a later version of duio_mesh")
 """Top-level keys that no version accepts yet; to accept one, give it a field in Topology and delete it here."""
 
 MAX_STATES = 2000
@@ -25,6 +26,7 @@ Vector: TypeAlias = list[float]
 Matrix: TypeAlias = list[list[float]]
 Positive: TypeAlias = Annotated[float, Field(gt=0)]
 NotNegative: TypeAlias = Annotated[float, Field(ge=0)]
+Probability: TypeAlias = Annotated[float, Field(ge=0, le=1)]
 Seconds: TypeAlias = Annotated[float, Field(ge=1e-9, le=1e9)]
 Name: TypeAlias = Annotated[str, Field(min_length=1, max_length=100)]
 
@@ -214,6 +216,108 @@ class Run(Strict):
     convergence: Convergence
     deadline: Annotated[float, Field(gt=0, le=86_400, description="seconds to wait for any one message")] = 5.0
     window: Annotated[int, Field(ge=1, le=100_000, description="steps that the plant may be ahead")] = 64
+    batch: Annotated[
+        int, Field(ge=1, le=10_000, description="steps fused as one block (admm only); estimates come so much late")
+    ] = 1
+
+
+class GilbertElliott(Strict):
+    """Losses in bursts: from step to step the edge turns bad and good again, and loses frames accordingly."""
+
+    worsen: Annotated[float, Field(gt=0, le=1, description="probability of good -> bad from one step to the next")]
+    mend: Annotated[float, Field(gt=0, le=1, description="probability of bad -> good; bad lasts 1 / mend steps")]
+    good: Annotated[Probability, Field(description="loss while good")] = 0.0
+    bad: Annotated[Probability, Field(description="loss while bad")] = 1.0
+
+
+Late: TypeAlias = Annotated[int, Field(ge=0, le=MAX_DELAY)]
+Range: TypeAlias = Annotated[list[Late], Field(min_length=2, max_length=2)]
+
+
+class Delay(OneOf):
+    """How late frames are: always the same, or drawn anew for every frame between two numbers."""
+
+    forms = ("steps", "rounds")
+    steps: Annotated[Late | Range | None, Field(description="whole steps")] = None
+    rounds: Annotated[
+        Late | Range | None, Field(description="exchanges; past a step's last one they go on in the next")
+    ] = None
+
+
+During: TypeAlias = Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=2, max_length=2)]
+"""From this step up to, not including, that step."""
+Pairs: TypeAlias = Annotated[list[Annotated[list[int], Field(min_length=2, max_length=2)]], Field(min_length=1)]
+
+
+class Affected(Strict):
+    """Which edges, and when."""
+
+    edges: Annotated[Pairs | None, Field(description="[i, j]: both directions")] = None
+    arcs: Annotated[Pairs | None, Field(description="[source, target]: one direction")] = None
+    during: Annotated[During | None, Field(description="[first step, first step after]; default: always")] = None
+
+    @model_validator(mode="after")
+    def _fit(self) -> Affected:
+        if self.edges is not None and self.arcs is not None:
+            raise _misfit("give either edges or arcs, not both", at="arcs")
+        if self.during is not None and self.during[0] >= self.during[1]:
+            raise _misfit(f"should end after it begins, not {self.during}", at="during")
+        return self
+
+
+class LinkFault(Affected):
+    """What happens to the frames on some edges; on all of them when none is named."""
+
+    loss: Annotated[Probability, Field(description="independent for every frame")] = 0.0
+    gilbert_elliott: GilbertElliott | None = None
+    delay: Delay | None = None
+    duplicate: Annotated[Probability, Field(description="a second copy follows")] = 0.0
+    reorder: Annotated[Probability, Field(description="overtaken by the next frame: one round late")] = 0.0
+    corrupt: Annotated[Probability, Field(description="one bit flipped; the frame check refuses it")] = 0.0
+
+    @model_validator(mode="after")
+    def _something(self) -> LinkFault:
+        if not (self.loss or self.duplicate or self.reorder or self.corrupt or self.gilbert_elliott or self.delay):
+            raise _misfit("says no fault: give loss, gilbert_elliott, delay, duplicate, reorder or corrupt")
+        return self
+
+
+class Cut(Affected):
+    """Nothing passes on these edges for a while."""
+
+    @model_validator(mode="after")
+    def _complete(self) -> Cut:
+        if self.edges is None and self.arcs is None:
+            raise _misfit("should have one of the keys edges or arcs")
+        if self.during is None:
+            raise _misfit("should have the key during: [first step, first step after]")
+        return self
+
+
+class NodeFault(OneOf):
+    """What happens to a process at the beginning of a step."""
+
+    forms = ("kill", "pause", "restart")
+    node: int
+    kill: Annotated[int | None, Field(ge=0, description="the step")] = None
+    pause: Annotated[int | None, Field(ge=0, description="the step")] = None
+    restart: Annotated[int | None, Field(ge=0, description="the step")] = None
+    seconds: Annotated[float | None, Field(gt=0, le=86_400, description="how long a pause lasts")] = None
+
+    @model_validator(mode="after")
+    def _seconds_belong_to_pause(self) -> NodeFault:
+        if (self.seconds is None) != (self.pause is None):
+            raise _misfit("pause and seconds belong together: {node, pause: step, seconds: how long}")
+        return self
+
+
+class Faults(Strict):
+    """Faults on purpose, the same in every run with the same seed."""
+
+    seed: Annotated[int | None, Field(ge=0, lt=1 << 63, description="of the faults alone; default: run.seed")] = None
+    links: Annotated[list[LinkFault], Field(default_factory=list)]
+    cuts: Annotated[list[Cut], Field(default_factory=list)]
+    nodes: Annotated[list[NodeFault], Field(default_factory=list)]
 
 
 class Heading(Strict):
@@ -231,3 +335,4 @@ class Topology(Heading):
     nodes: dict[int, Node]
     graph: Graph
     run: Run
+    faults: Faults | None = None

@@ -11,7 +11,7 @@ from scipy import linalg
 
 from duio_mesh.arrays import Array, contiguous
 from duio_mesh.errors import DesignError
-from duio_mesh.scenario.model import Lqr, Normal, OpenLoop, Plant, Scenario
+from duio_mesh.scenario.model import Lqr, Normal, OpenLoop, Plant, Run, Scenario
 from duio_mesh.spec import NodeSpec, PlantSpec, SensorSpec
 from duio_mesh.synthesis.propagation import propagators
 
@@ -45,15 +45,21 @@ def node_spec(
         tells=scenario.graph.tells(i),
         steps=run.steps,
         deadline=run.deadline,
-        window=run.window,
-        credit=_quarter(run.window),
-        block=_quarter(run.window),
+        window=_window(run),
+        credit=_quarter(run),
+        block=_quarter(run),
+        batch=run.batch,
     )
 
 
-def _quarter(window: int) -> int:
+def _window(run: Run) -> int:
+    """Steps that the plant may be ahead: at least two batches, or a node could not fill one while it fuses another."""
+    return max(run.window, 2 * run.batch)
+
+
+def _quarter(run: Run) -> int:
     """Steps between two words from node to plant, and in one frame from plant to node: few enough to keep both busy."""
-    return max(1, window // 4)
+    return max(1, _window(run) // 4)
 
 
 def plant_spec(scenario: Scenario) -> PlantSpec:
@@ -88,8 +94,8 @@ def plant_spec(scenario: Scenario) -> PlantSpec:
         sensors=tuple(sensors),
         seed=run.seed,
         steps=run.steps,
-        window=run.window,
-        block=_quarter(run.window),
+        window=_window(run),
+        block=_quarter(run),
         deadline=run.deadline,
     )
 

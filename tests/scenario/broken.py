@@ -169,7 +169,7 @@ TOP = [
     case("description is a list", ("description: Two states, two nodes", "description: §[1]"), words="should be text"),
     case("unknown top key", ("graph:", "§grahp:"), ("name: tiny", "§name: tiny"),
          words=("graph: is missing", "grahp: unknown key (did you mean graph?)")),
-    case("faults", ("run:", "§faults: {loss: 0.1}\nrun:"), words="faults: is reserved for a later version"),
+    case("security", ("run:", "§security: {open: 1}\nrun:"), words="security: is reserved for a later version"),
     case("timing, security, hosts", ("run:", "§timing: {}\n§security: {}\n§hosts: {}\nrun:"),
          words=("timing: is reserved", "security: is reserved", "hosts: is reserved")),
     case("sections missing", ("name: tiny", "§§§name: tiny"), (without("plant:", "observer:"), ""),
@@ -444,6 +444,45 @@ MANY = [
          words="plant.inputs.0: should be text, not a list"),
 ]
 
+
+def faulty(name: str, faults: str, words: str | tuple[str, ...]) -> Case:
+    """The valid file with these faults."""
+    return case(name, ("run:", f"faults: {faults}\nrun:"), words=words)
+
+
+FAULTS = [
+    faulty("faults is a number", "§0.1", "faults: should be a mapping, not 0.1"),
+    faulty("loss without links", "{§loss: 0.1}", "faults.loss: unknown key"),
+    faulty("misspelt links", "{§lnks: [{loss: 0.1}]}", "faults.lnks: unknown key (did you mean links?)"),
+    faulty("misspelt loss", "{links: [{§los: 0.1}, {loss: 0.1}]}",
+           "faults.links.0.los: unknown key (did you mean loss?)"),
+    faulty("loss above 1", "{links: [{loss: §5}]}", "faults.links.0.loss: should be at most 1, not 5"),
+    faulty("loss below 0", "{links: [{loss: §-0.1}]}", "faults.links.0.loss: should be at least 0, not -0.1"),
+    faulty("loss is text", "{links: [{loss: §5 %}]}", "faults.links.0.loss: should be a number, not the text '5 %'"),
+    faulty("a fault that is none", "{links: [§{edges: [[1, 2]]}]}", "faults.links.0: says no fault"),
+    faulty("edge that is not there", "{links: [{edges: [[1, 2], §[1, 3]], loss: 0.1}]}",
+           "faults.links.0.edges.1: [1, 3] is not an edge of the graph"),
+    faulty("faulty edges and arcs", "{links: [{edges: [[1, 2]], §arcs: [[1, 2]], loss: 0.1}]}",
+           "give either edges or arcs"),
+    faulty("edge with a weight", "{links: [{edges: [§[1, 2, 3]], loss: 0.1}]}", "should have at most 2 entries, not 3"),
+    faulty("no edges", "{links: [{edges: §[], loss: 0.1}]}", "faults.links.0.edges: should have at least 1 entry"),
+    faulty("during ends before it begins", "{links: [{loss: 0.1, §during: [8, 8]}]}", "should end after it begins"),
+    faulty("two delays", "{links: [{delay: {steps: 1, §rounds: 1}}]}", "give either steps or rounds, not both"),
+    faulty("delay without a unit", "{links: [{delay: §1}]}", "faults.links.0.delay: should be a mapping, not 1"),
+    faulty("empty delay", "{links: [{delay: §{}}]}", "should have one of the keys steps or rounds"),
+    faulty("half a step late", "{links: [{delay: {steps: §0.5}}]}", "should be a whole number"),
+    faulty("delay backwards", "{links: [{delay: {steps: §[3, 1]}}]}", "should be [least, most], not [3, 1]"),
+    faulty("never mends", "{links: [{gilbert_elliott: {worsen: 0.1, mend: §0}}]}", "should be greater than 0, not 0"),
+    faulty("half a chain", "{links: [{§gilbert_elliott: {worsen: 0.1}}]}", "gilbert_elliott.mend: is missing"),
+    faulty("cut without a time", "{cuts: [§{edges: [[1, 2]]}]}", "should have the key during"),
+    faulty("cut without an edge", "{cuts: [§{during: [1, 2]}]}", "should have one of the keys edges or arcs"),
+    faulty("kill nobody", "{nodes: [{node: §3, kill: 5}]}",
+           "faults.nodes.0.node: no such node: 3; the nodes are 1 and 2"),
+    faulty("kill and pause", "{nodes: [{node: 1, kill: 5, §pause: 6}]}", "give either kill or pause, not both"),
+    faulty("pause for how long", "{nodes: [§{node: 1, pause: 5}]}", "pause and seconds belong together"),
+    faulty("faulty seed", "{seed: §-1}", "faults.seed: should be at least 0, not -1"),
+]
+
 CASES: list[Case] = [
-    *SYNTAX, *NUMBERS, *TOP, *PLANT, *DRIVES, *OBSERVER, *NODES, *GRAPH, *RUN, *BY_FILE, *MANY
+    *SYNTAX, *NUMBERS, *TOP, *PLANT, *DRIVES, *OBSERVER, *NODES, *GRAPH, *RUN, *FAULTS, *BY_FILE, *MANY
 ]

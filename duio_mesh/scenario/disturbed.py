@@ -1,0 +1,91 @@
+"""The faults of a topology, checked against its graph."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+from duio_mesh.faults import ALWAYS, Faults, NodeFault, Rule
+from duio_mesh.scenario import model, schema
+from duio_mesh.scenario.problems import Path, Problems, listed
+from duio_mesh.scenario.validate import whole
+
+Arc = tuple[int, int]
+
+
+def read_faults(written: Any, graph: model.Graph | None, seed: int, problems: Problems) -> Faults:
+    """The faults; ``seed`` is the run's, for when they have none of their own.
+
+    Rules are numbered in the order of the file, links before cuts: the number is part of the key of a rule's draws.
+    """
+    path: Path = ("faults",)
+    if written is None:
+        return Faults(seed)
+    faults = whole(schema.Faults, written, path, problems)
+    if faults is None:
+        return Faults(seed)
+    rules: dict[Arc, list[Rule]] = {}
+    entries: list[tuple[str, int, schema.Affected]] = [("links", k, link) for k, link in enumerate(faults.links)]
+    entries += [("cuts", k, cut) for k, cut in enumerate(faults.cuts)]
+    for number, (key, k, entry) in enumerate(entries):
+        rule = _rule(number, entry, (*path, key, k), problems)
+        for arc in _arcs(entry, (*path, key, k), graph, problems):
+            rules.setdefault(arc, []).append(rule)
+    nodes = [_node(fault, (*path, "nodes", k), graph, problems) for k, fault in enumerate(faults.nodes)]
+    links = {arc: tuple(several) for arc, several in sorted(rules.items())}
+    return Faults(seed if faults.seed is None else faults.seed, links, tuple(nodes))
+
+
+def _rule(number: int, entry: schema.Affected, path: Path, problems: Problems) -> Rule:
+    during = (entry.during[0], entry.during[1]) if entry.during is not None else ALWAYS
+    if not isinstance(entry, schema.LinkFault):
+        return Rule(number, during, loss=1.0)
+    delay, burst = entry.delay, entry.gilbert_elliott
+    return Rule(
+        number,
+        during,
+        loss=entry.loss,
+        burst=(burst.worsen, burst.mend, burst.good, burst.bad) if burst else (),
+        delay_steps=_range(delay.steps, (*path, "delay", "steps"), problems) if delay else (0, 0),
+        delay_rounds=_range(delay.rounds, (*path, "delay", "rounds"), problems) if delay else (0, 0),
+        duplicate=entry.duplicate,
+        reorder=entry.reorder,
+        corrupt=entry.corrupt,
+    )
+
+
+def _range(written: int | list[int] | None, path: Path, problems: Problems) -> tuple[int, int]:
+    if written is None:
+        return (0, 0)
+    least, most = (written, written) if isinstance(written, int) else written
+    if least > most:
+        problems.at(path, f"should be [least, most], not {[least, most]}")
+    return (least, most)
+
+
+def _arcs(entry: schema.Affected, path: Path, graph: model.Graph | None, problems: Problems) -> Iterable[Arc]:
+    """The directed edges that an entry means: both directions of an edge, as far as the graph has them."""
+    there = {(a.source, a.target) for a in graph.arcs} if graph is not None else None
+    if entry.edges is None and entry.arcs is None:
+        return sorted(there or ())
+    found: dict[Arc, None] = {}
+    key = "edges" if entry.edges is not None else "arcs"
+    for k, (i, j) in enumerate(entry.edges or entry.arcs or ()):
+        wanted = [(i, j), (j, i)] if key == "edges" else [(i, j)]
+        present = [arc for arc in wanted if there is None or arc in there]
+        if not present:
+            hint = "; arcs go from source to target" if key == "arcs" and there and (j, i) in there else ""
+            kind = "an edge" if key == "edges" else "an arc"
+            problems.at((*path, key, k), f"[{i}, {j}] is not {kind} of the graph{hint}")
+        found |= dict.fromkeys(present)
+    return found
+
+
+def _node(fault: schema.NodeFault, path: Path, graph: model.Graph | None, problems: Problems) -> NodeFault:
+    if graph is not None and graph.ids and fault.node not in graph.ids:
+        problems.at((*path, "node"), f"no such node: {fault.node}; the nodes are {listed(graph.ids, 'and')}")
+    if fault.kill is not None:
+        return NodeFault(fault.node, "kill", fault.kill)
+    if fault.restart is not None:
+        return NodeFault(fault.node, "restart", fault.restart)
+    return NodeFault(fault.node, "pause", fault.pause or 0, fault.seconds or 0.0)
