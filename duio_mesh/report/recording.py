@@ -126,7 +126,7 @@ class Recording:
     def fill(self, truth: Array, estimates: Mapping[int, Array]) -> None:
         """Take what is missing from whole files: row k of each is step k. They may be short, or memory maps.
 
-        Rows that are NaN throughout were never written by anybody and stay missing.
+        Rows whose states are all NaN were never written by anybody and stay missing.
         """
         window = self._pairing.window
         wanted = {i: spans for i, spans in self.missing().items() if i is None or i in estimates}
@@ -207,7 +207,7 @@ class Recording:
 
     def _give(self, source: int | None, k: int, rows: Array) -> None:
         """Take the rows that somebody wrote."""
-        for first, last in runs(np.flatnonzero(~np.isnan(rows).all(axis=1))):
+        for first, last in runs(np.flatnonzero(~np.isnan(rows[:, : self._spec.n]).all(axis=1))):
             part = np.asarray(rows[first:last])
             if source is None:
                 self.truth(k + first, part)
