@@ -8,20 +8,31 @@ the estimate of x(k).
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
 from math import isfinite
 
 import numpy as np
 
+from duio_mesh.arrays import Array
 from duio_mesh.errors import RunError
 from duio_mesh.journal import Journal
 from duio_mesh.mesh import Mesh
 from duio_mesh.mesh.lockstep import Exchange, Line, Lockstep
 from duio_mesh.observers import make_observer
+from duio_mesh.observers.base import reader
 from duio_mesh.process import Report, main
 from duio_mesh.spec import NodeSpec
 
 NO_VECTOR = np.zeros(0)
 BEAT = 0.5  # seconds between signs of life inside a step
+
+
+def _samples(lockstep: Lockstep, plant: Line, spec: NodeSpec) -> Iterator[Array]:
+    """[y_i(k); u_i(k)] for k = 0, 1, ...: the plant sends a few steps in one frame."""
+    size = spec.p + spec.m
+    for k in range(0, spec.steps, spec.block):
+        count = min(spec.block, spec.steps - k)
+        yield from lockstep.take(plant, k, 0, count * size).reshape(count, size)
 
 
 def run(spec: NodeSpec, report: Report) -> None:
@@ -42,15 +53,15 @@ def run(spec: NodeSpec, report: Report) -> None:
         report("ready")
         row = sum(part.size for part in observer.estimate())
         zeros = np.zeros(spec.n)
-        rounds, begin = 0, time.monotonic()
+        estimates, samples = reader(observer), _samples(lockstep, plant, spec)
+        rounds, promised, begin = 0, spec.credit, time.monotonic()
         beat = begin + BEAT
         with lockstep, Journal(spec.output, row, trace) as journal:
-            for k in range(spec.steps):
-                if k % spec.block == 0:  # the samples of the next few steps come in one frame
-                    count = min(spec.block, spec.steps - k)
-                    samples = lockstep.take(plant, k, 0, count * (p + spec.m)).reshape(count, p + spec.m)
-                sample = samples[k % spec.block]
-                observer.sample(sample[:p], sample[p:])
+            for k in range(0, spec.steps, spec.batch):
+                done = min(k + spec.batch, spec.steps)
+                for _ in range(k, done):
+                    sample = next(samples)
+                    observer.sample(sample[:p], sample[p:])
                 for r in range(observer.rounds):
                     observer.exchange(r, exchange(k, r, observer.message(r)))
                     rounds += 1
@@ -58,12 +69,13 @@ def run(spec: NodeSpec, report: Report) -> None:
                         beat = now + BEAT
                         credit.send(k, 0, NO_VECTOR)
                         report.beat()
-                estimate = observer.estimate()
-                if not isfinite(zeros.dot(estimate.state)):
-                    raise RunError(f"node-{i}: the estimate overflowed at step {k}; is the plant unstable?")
-                journal.add(estimate)
-                if (k + 1) % spec.credit == 0 or k + 1 == spec.steps:
-                    credit.send(k + 1, 0, NO_VECTOR)
+                for estimate in estimates():
+                    if not isfinite(zeros.dot(estimate.state)):
+                        raise RunError(f"node-{i}: the estimate overflowed at step {k}; is the plant unstable?")
+                    journal.add(estimate)
+                if done >= promised or done == spec.steps:
+                    promised = done + spec.credit
+                    credit.send(done, 0, NO_VECTOR)
         report(
             "done",
             steps=spec.steps,

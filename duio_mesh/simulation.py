@@ -9,6 +9,7 @@ import numpy as np
 from duio_mesh.arrays import Array
 from duio_mesh.dynamics import Plant
 from duio_mesh.observers import make_observer
+from duio_mesh.observers.base import reader
 from duio_mesh.synthesis.design import Design
 from duio_mesh.trace import Trace as Trace  # re-exported: it lives lower, where report/ may import it
 
@@ -18,12 +19,16 @@ def simulate(design: Design, progress: Callable[[int], None] = lambda _: None) -
     plant = Plant(design.plant)
     observers = {i: make_observer(spec) for i, spec in design.nodes.items()}
     truth, rows = [], {i: list[Array]() for i in observers}
-    for k in range(design.plant.steps):
-        data = plant.sample()
-        truth.append(plant.x)
-        for i, observer in observers.items():
-            p = design.nodes[i].p
-            observer.sample(data[i][:p], data[i][p:])
+    steps, batch = design.plant.steps, design.scenario.run.batch
+    for k in range(0, steps, batch):
+        done = min(k + batch, steps)
+        for _ in range(k, done):
+            data = plant.sample()
+            truth.append(plant.x)
+            for i, observer in observers.items():
+                p = design.nodes[i].p
+                observer.sample(data[i][:p], data[i][p:])
+            plant.advance()
         rounds = {i: o.rounds for i, o in observers.items()}  # islands may need different numbers of them
         for r in range(max(rounds.values())):
             turn = {i: o for i, o in observers.items() if r < rounds[i]}
@@ -31,9 +36,8 @@ def simulate(design: Design, progress: Callable[[int], None] = lambda _: None) -
             for i, observer in turn.items():
                 observer.exchange(r, {j: sent[j] for j in design.nodes[i].hears})
         for i, observer in observers.items():
-            rows[i].append(np.concatenate(observer.estimate()))
-        plant.advance()
-        progress(k + 1)
+            rows[i] += [np.concatenate(estimate) for estimate in reader(observer)()]
+        progress(done)
     return split_trace(design, np.array(truth), {i: np.array(r) for i, r in rows.items()})
 
 

@@ -12,7 +12,7 @@ exact mean of the n (n+1)/2 numbers of T_j'T_j over the island, times the island
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
@@ -41,18 +41,20 @@ class Observer:
         self._xhat = np.zeros(n)
         self.on_round: OnRound | None = None
         """Set it before a step to watch that step's rounds: |T_i x_i - xi_i| and the largest |x_i - x_j| heard."""
+        self._left, self._full = spec.steps, spec.batch
+        self._block: list[Array] = []  # xi of the samples that the next rounds fuse
+        self._fusions: dict[int, Fusion] = {}  # by width: the last block of a run may be shorter
         self._fusion: Fusion | None = None
-        self._setup = FiniteTimeAverage({}, (), 0)
-        if spec.options["setup"] == "distributed":
+        self._Hinv = m.get("Hinv")
+        self._setup, self._ready = FiniteTimeAverage({}, (), 0), spec.options["setup"] == "global"
+        if not self._ready:
             self._setup = FiniteTimeAverage(spec.hears, spec.options["eigenvalues"], n * (n + 1) // 2)
             self._setup.state[:] = (m["T"].T @ m["T"])[np.tril_indices(n)]
-        else:
-            self._fusion = make_fusion(m["T"], m.get("Hinv"), spec.hears, spec.options)
-        self._ahead = self._setup.rounds  # rounds before the fusion's first, in this step
+        self._ahead = self._setup.rounds  # rounds before the fusion's first, in this block
 
     @property
     def rounds(self) -> int:
-        """Exchanges of the current step; the set-up adds some to step 0."""
+        """Exchanges of the current block; the set-up adds some to the first."""
         return self._ahead + fusion_rounds(self._options)
 
     def sample(self, y: Array, u: Array) -> None:
@@ -60,9 +62,15 @@ class Observer:
         self._s[:] = self._next
         self._y[:], self._u[:] = y, u
         np.dot(self._local, self._own, out=self._next)
-        if self._fusion is not None:
+        if len(self._block) == self._full:
+            self._block = []
+        self._block.append(self._xi.copy())
+        self._left -= 1
+        if len(self._block) < self._full and self._left:
+            return
+        if self._ready:
             self._ahead = 0
-            self._fusion.begin(self._xi)
+            self._begin()
         elif not self._ahead:
             self._finish_setup()
 
@@ -74,7 +82,7 @@ class Observer:
 
     def exchange(self, r: int, received: Mapping[int, Array]) -> None:
         """The next iterate from the neighbours' present ones. Raises RunError when one is missing in a set-up round."""
-        if self._fusion is not None:
+        if self._ready and self._fusion is not None:
             if self.on_round is not None:
                 self._tell(self.on_round, r, self._fusion.state, received)
             self._fusion.exchange(r - self._ahead, received)
@@ -90,8 +98,23 @@ class Observer:
             self._finish_setup()
 
     def estimate(self) -> Estimate:
-        """x_i after the last round."""
-        return Estimate(self._xhat if self._fusion is None else self._fusion.state)
+        """x_i of the newest sample, after the last round."""
+        return self.batch()[-1] if self._fusion else Estimate(self._xhat)
+
+    def batch(self) -> Sequence[Estimate]:
+        """x_i of every sample of the block, after the last round."""
+        if self._fusion is None:
+            return ()
+        columns = self._fusion.state.reshape(self._xhat.size, -1)
+        return [Estimate(contiguous(column)) for column in columns.T]
+
+    def _begin(self) -> None:
+        """Start the fusion of the block's xi, side by side."""
+        width = len(self._block)
+        if width not in self._fusions:
+            self._fusions[width] = make_fusion(self._T, self._Hinv, self._hears, self._options, width)
+        self._fusion = self._fusions[width]
+        self._fusion.begin(np.stack(self._block, axis=1).ravel())
 
     def _finish_setup(self) -> None:
         """H from the mean of all T_j'T_j. Every node's copy differs in the last bits; nothing compares them."""
@@ -99,9 +122,10 @@ class Observer:
         H: Array = np.zeros((n, n))
         H[np.tril_indices(n)] = self._options["island_size"] * self._setup.state
         H += np.tril(H, -1).T
-        self._fusion = make_fusion(self._T, np.linalg.inv(H).astype(np.float64), self._hears, self._options)
-        self._fusion.begin(self._xi)
+        self._Hinv, self._ready = np.linalg.inv(H).astype(np.float64), True
+        self._begin()
 
     def _tell(self, on_round: OnRound, r: int, x: Array, received: Mapping[int, Array]) -> None:
         apart = max((float(np.linalg.norm(x - other)) for other in received.values()), default=0.0)
-        on_round(r - self._ahead, float(np.linalg.norm(self._T @ x - self._xi)), apart)
+        residual = self._T @ x.reshape(self._xhat.size, -1) - np.stack(self._block, axis=1)
+        on_round(r - self._ahead, float(np.linalg.norm(residual)), apart)

@@ -13,7 +13,7 @@ The vector returned by ``message`` may be a buffer that the next call overwrites
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -54,3 +54,25 @@ class Observer(Protocol):
     def estimate(self) -> Estimate:
         """The estimate of x(k), valid once the step's exchanges are done; zeros of the right sizes before step 0."""
         ...
+
+
+class BatchObserver(Observer, Protocol):
+    """An observer without memory between its exchanges: ``spec.batch`` calls of ``sample``, then one set of rounds.
+
+    The last batch of a run may be shorter.
+    """
+
+    def batch(self) -> Sequence[Estimate]:
+        """The estimates of all samples since the last rounds, in order."""
+        ...
+
+
+def can_batch(observer: type[Observer]) -> bool:
+    """Whether this class of observers takes several steps at once."""
+    return hasattr(observer, "batch")
+
+
+def reader(observer: Observer) -> Callable[[], Sequence[Estimate]]:
+    """How to read what a set of rounds has given: a batch where the observer makes one, else one estimate."""
+    batch: Callable[[], Sequence[Estimate]] | None = getattr(observer, "batch", None)
+    return batch or (lambda: (observer.estimate(),))

@@ -6,6 +6,8 @@ import importlib
 from collections.abc import Callable
 from typing import Any
 
+from duio_mesh.errors import DesignError
+from duio_mesh.observers.base import can_batch
 from duio_mesh.scenario.model import Scenario
 from duio_mesh.synthesis.design import Design
 
@@ -24,5 +26,11 @@ def synthesise(scenario: Scenario, progress: Callable[[str], None] = lambda _: N
     ``progress`` is called with a short sentence before each long piece of work.
     Raises DesignError when a condition fails or no gains exist; the message says which, where and by how much.
     """
+    observer = importlib.import_module(f"duio_mesh.observers.{scenario.method}").Observer
+    if (batch := scenario.run.batch) > 1 and not can_batch(observer):
+        raise DesignError(
+            f"run.batch: {scenario.method} needs each step's exchange before the next step, so it cannot take {batch} "
+            "steps at once; remove run.batch, or use a method without memory between its fusions (admm)"
+        )
     design: Design = importlib.import_module(f"duio_mesh.synthesis.{scenario.method}").design(scenario, progress)
     return design

@@ -49,6 +49,8 @@ def node_spec(
         credit=_quarter(run),
         block=_quarter(run),
         batch=run.batch,
+        faults=scenario.faults.into(i),
+        without=scenario.options.without if scenario.faults.links else "",
     )
 
 
