@@ -15,7 +15,7 @@ from duio_mesh.report.topology import positions
 VIEWS = 12  # states that are shown side by side
 LINES = 16  # nodes whose lines share a view, and nodes with a tab of their own
 LEGEND = 12  # lines that a legend names
-NAMED, WORDS = 64, 8  # nodes that are named in the topology view, and that are called more than their id
+NAMED, WORDS = 32, 8  # nodes that are named in the topology view, and that are called more than their id
 LABEL = 0xE6EDF3FF
 NODE, RING, EDGE = 0.16, 0.23, 0.035  # radii in the topology view, where neighbours are about 1 apart
 

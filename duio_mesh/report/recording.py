@@ -21,7 +21,7 @@ from duio_mesh.report.streams import Batch, FileStream, LiveStream, Opening
 from duio_mesh.spec import RecorderSpec
 
 SENDS = 100  # of one series in a whole run: a viewer is behind by one percent of the plot's width at most
-CHUNKS = 20_000  # sends of a whole run, all series: each costs 50 microseconds and 2 kB whatever is in it
+CHUNKS = 8_000  # sends of a whole run, all series: each costs 50 microseconds and 2 kB whatever is in it
 
 
 class Recording:
