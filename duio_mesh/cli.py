@@ -33,6 +33,7 @@ examples:
   python launch.py topologies/ring.yaml --steps 2000 --seed 7 --plot
   python launch.py topologies/ring.yaml --set plant.noise.variance=0 --set graph.edges='[[1,2],[3,4]]'
   python launch.py topologies/six_state_ring.yaml --check
+  python launch.py new heat --rooms 8x8 --nodes 16 --out topologies/heat8x8.yaml   (new --help: write a topology file)
 """
 
 
@@ -69,6 +70,11 @@ def parser() -> argparse.ArgumentParser:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; the exit code."""
+    argv = sys.argv[1:] if argv is None else argv
+    if list(argv[:1]) == ["new"]:
+        from duio_mesh.generate import command
+
+        return command.main(argv[1:])
     args = parser().parse_args(argv)
     for number in (signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, _interrupt)
@@ -141,7 +147,7 @@ def _run(design: Design, args: argparse.Namespace, supervisor: Supervisor | None
                 record=not args.no_record,
                 live=args.live,
                 show=show,
-                hold=console.hold if args.live else None,
+                watcher=console.Watcher() if args.live else None,
                 supervisor=supervisor,
             )
     if args.plot:
