@@ -1,122 +1,93 @@
-"""Lockstep rounds per second: the project's mesh against a bare Zenoh exchange of the same vectors, interleaved.
+"""Lockstep rounds per second on a ring: the project's mesh against the same exchange over bare transports.
 
-    python bench/exchange.py [--rounds 20000] [--repeat 5]
+    python bench/exchange.py [--nodes 4 8 16 32] [--rounds 8000] [--size 6] [--repeat 5] [--memory 4 16 64]
 
-The bare exchange is written here without any of the project's code: N processes in a ring, tcp on loopback, one key per
-directed edge, BLOCK, a FIFO channel per neighbour, one 8-byte header and the vector as bytes. Both runs use the same
-Zenoh settings for links and threads. Absolute numbers of a shared machine mean little; the ratio is within one run.
+The rivals (rivals.py) share no code with the project. Its own rows: `admm` on a generated ring of N nodes, 199 rounds a
+step, so that plant and journals do not count; and, for N = 4, the nine-room ring with one round a step, plant, journals
+and recorder included. All of one N are interleaved in shuffled order. Absolute numbers of a shared machine mean little;
+the ratios are within one run.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
-import multiprocessing
 import os
-import socket
 import statistics
-import struct
-import sys
-import tempfile
-import time
+from functools import partial
 from pathlib import Path
-from typing import Any
 
-os.environ.setdefault(
-    "ZENOH_RUNTIME", "(acc:(handover:app),rx:(handover:app),net:(handover:app),app:(worker_threads:1))"
-)
+import rings
+import rivals
+from interleave import Contenders, interleaved, machine, table
 
-SIZE = 9  # float64 a message, as in the nine-room building
+from duio_mesh.launcher import Progress
+
+REFERENCE = "bare Zenoh"
+ROUNDS = 199  # exchanges per step of the project's ring
+MPI_SHARE = 10  # MPI spins while it waits: with more processes than cores it gets a tenth of the rounds
 
 
-def bare_node(i: int, count: int, ports: list[int], rounds: int, results: Any) -> None:
-    """One process of the bare exchange."""
-    import numpy as np
-    import zenoh
-
-    config = zenoh.Config()
-    neighbours = sorted({(i - 1) % count, (i + 1) % count} - {i})
-    settings = {
-        "mode": "peer",
-        "listen/endpoints": [f"tcp/127.0.0.1:{ports[i]}"],
-        "connect/endpoints": [f"tcp/127.0.0.1:{ports[j]}" for j in neighbours if j < i],
-        "connect/retry": {"period_init_ms": 10, "period_max_ms": 100, "period_increase_factor": 1.5},
-        "open/return_conditions/connect_scouted": False,
-        "scouting/multicast/enabled": False,
-        "scouting/gossip/enabled": False,
-        "transport/shared_memory/enabled": False,
+def contenders(count: int, rounds: int, size: int) -> Contenders:
+    """Everybody's measurement for a ring of ``count`` processes."""
+    ring = rings.admm_ring(count, max(1, rounds // ROUNDS), {"nu": ROUNDS + 1})
+    found = {
+        REFERENCE: partial(rivals.bare_zenoh, count, rounds, size),
+        "duio_mesh, admm": lambda: float(rings.run_mesh(ring)["rounds_per_second"]),
     }
-    for key, value in settings.items():
-        config.insert_json5(key, json.dumps(value))
-    with zenoh.open(config) as session:
-        heard = [session.declare_subscriber(f"e/{j}/{i}", zenoh.handlers.FifoChannel(64)) for j in neighbours]
-        ready = [session.declare_subscriber(f"r/{j}/{i}") for j in neighbours]
-        block = zenoh.CongestionControl.BLOCK
-        told = [session.declare_publisher(f"e/{i}/{j}", congestion_control=block, express=False) for j in neighbours]
-        barrier = [session.declare_publisher(f"r/{i}/{j}") for j in neighbours]
-        matched = [publisher.declare_matching_listener() for publisher in barrier]
-        for publisher, listener in zip(barrier, matched, strict=True):
-            while not publisher.matching_status.matching:
-                listener.recv()
-        x, header = np.arange(float(SIZE)), struct.Struct("<Q")
-        begin = time.perf_counter()
-        for k in range(rounds):
-            frame = header.pack(k) + x.tobytes()
-            for publisher in told:
-                publisher.put(frame)
-            for subscriber in heard:
-                data = subscriber.recv().payload.to_bytes()
-                if header.unpack_from(data)[0] != k:
-                    raise SystemExit(f"round {header.unpack_from(data)[0]} instead of {k}")
-                np.frombuffer(data, offset=8)
-        results.put((i, rounds / (time.perf_counter() - begin)))
-        del ready
+    if count == 4:
+        nine = rings.lmi_ring(rounds)
+        found["duio_mesh, lmi, n = 9, recorded"] = lambda: float(rings.run_mesh(nine, record=True)["rounds_per_second"])
+    return found | {
+        "pyzmq PAIR, ipc": partial(rivals.zmq_pair, count, rounds, size),
+        "multiprocessing.Pipe": partial(rivals.pipes, count, rounds, size),
+        "mpi4py Neighbor_allgather": partial(rivals.mpi, count, max(1, rounds // MPI_SHARE), size),
+    }
 
 
-def bare(count: int, rounds: int) -> float:
-    """Rounds per second of the bare exchange, the slowest node's."""
-    held = [socket.socket() for _ in range(count)]
-    for s in held:
-        s.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        s.bind(("127.0.0.1", 0))
-    ports = [s.getsockname()[1] for s in held]
-    context = multiprocessing.get_context("spawn")
-    results = context.Queue()
-    nodes = [context.Process(target=bare_node, args=(i, count, ports, rounds, results)) for i in range(count)]
-    for node in nodes:
-        node.start()
-    speeds = [results.get(timeout=300)[1] for _ in nodes]
-    for node in nodes:
-        node.join()
-    for s in held:
-        s.close()
-    return min(speeds)
+def descendants(pid: int) -> list[int]:
+    """All processes below this one."""
+    found: list[int] = []
+    for path in Path(f"/proc/{pid}/task").glob("*/children"):
+        for child in map(int, path.read_text().split()):
+            found += [child, *descendants(child)]
+    return found
 
 
-def mesh(topology: Path, rounds: int, overrides: dict[str, Any]) -> float:
-    """Rounds per second of the project: plant, nodes, journals and recorder and all."""
-    import duio_mesh
+def node_memory(count: int) -> float:
+    """PSS of a node process in MB while the ring runs, the median over its nodes."""
+    sizes: list[float] = []
 
-    scenario = duio_mesh.load_scenario(topology, **overrides, **{"run.steps": rounds})
-    design = duio_mesh.synthesise(scenario)
-    with tempfile.TemporaryDirectory() as out:
-        return float(duio_mesh.run(design, Path(out) / "run", record=True).metrics["rounds_per_second"])
+    def look(progress: Progress) -> None:
+        if sizes or not progress.steps:
+            return
+        for pid in descendants(os.getpid()):
+            if (process := Path(f"/proc/{pid}")).joinpath("cmdline").read_bytes().startswith(b"duio-node-"):
+                lines = process.joinpath("smaps_rollup").read_text().splitlines()
+                sizes.extend(int(line.split()[1]) / 1024 for line in lines if line.startswith("Pss:"))
+
+    rings.run_mesh(rings.admm_ring(count, 4000 // count, {"nu": 60}), show=look)
+    if len(sizes) != count:
+        raise SystemExit(f"{len(sizes)} node processes instead of {count} were seen")
+    return statistics.median(sizes)
 
 
 def main() -> None:
-    """Interleave and print the table."""
+    """Interleave and print the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rounds", type=int, default=20_000)
+    parser.add_argument("--nodes", type=int, nargs="*", default=[4, 8, 16, 32])
+    parser.add_argument("--rounds", type=int, default=8000, help="of a ring of four; N nodes do 4/N of them")
+    parser.add_argument("--size", type=int, default=6, help="doubles a message of the bare exchanges")
     parser.add_argument("--repeat", type=int, default=5)
+    parser.add_argument("--memory", type=int, nargs="*", default=[4, 16, 64], help="rings whose nodes' PSS is reported")
     args = parser.parse_args()
-    ring = Path(__file__).parent.parent / "topologies" / "ring.yaml"
-    table = []
-    for repetition in range(args.repeat):
-        table.append((bare(4, args.rounds), mesh(ring, args.rounds, {})))
-        b, m = table[-1]
-        print(f"{repetition + 1}: bare {b:8.0f} rounds/s   mesh {m:8.0f} rounds/s   ratio {m / b:.2f}", flush=True)
-    ratios = [m / b for b, m in table]
-    print(f"ratio: median {statistics.median(ratios):.2f}, {min(ratios):.2f} to {max(ratios):.2f}", file=sys.stdout)
+    print(f"{machine()}; {args.repeat} repetitions\n", flush=True)
+    for count in args.nodes:
+        found = interleaved(contenders(count, max(ROUNDS, args.rounds * 4 // count), args.size), args.repeat)
+        print(table(f"ring of {count}", found, REFERENCE, "rounds/s"), flush=True)
+    if args.memory:
+        print("| nodes | PSS of a node, MB |\n|---|---|")
+    for count in args.memory:
+        print(f"| {count} | {node_memory(count):.1f} |", flush=True)
 
 
 if __name__ == "__main__":
