@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import secrets
-import socket
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -18,6 +16,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
+from duio_mesh import credentials
 from duio_mesh.arrays import Array
 from duio_mesh.errors import RunError
 from duio_mesh.report.description import describe
@@ -26,11 +25,11 @@ from duio_mesh.report.trace_file import write_trace
 from duio_mesh.run_folder import RunFolder
 from duio_mesh.scenario.model import Scenario
 from duio_mesh.simulation import Trace, estimate_sizes, reconstructs, simulate
-from duio_mesh.spec import NodeSpec, PlantSpec, RecorderSpec, Wire, write_spec
+from duio_mesh.spec import NodeSpec, PlantSpec, RecorderSpec, write_spec
 from duio_mesh.supervisor import Supervisor
 from duio_mesh.synthesis.design import Design
+from duio_mesh.wiring import LOOPBACK, Wiring, check_address
 
-LOOPBACK = "127.0.0.1"
 CLOSING = 10.0  # seconds for the recorder to fill gaps and close its file ...
 CLOSING_ROWS = 50_000  # ... and a second more for every so many rows
 
@@ -64,27 +63,31 @@ class RunResult:
 class Launch:
     """One run of a design over Zenoh on this host."""
 
-    def __init__(self, design: Design, folder: RunFolder, supervisor: Supervisor, *, record: bool, live: bool) -> None:
+    def __init__(
+        self,
+        design: Design,
+        folder: RunFolder,
+        supervisor: Supervisor,
+        *,
+        record: bool,
+        live: bool,
+        address: str = LOOPBACK,
+    ) -> None:
         self._design, self._folder, self._supervisor = design, folder, supervisor
         self._record, self._live = record, live
         self._sizes = estimate_sizes(design)
-        self._held: list[socket.socket] = []
+        self._wiring = Wiring(design, folder.keys, record=record, address=address)
 
     def specs(self) -> dict[str, NodeSpec | PlantSpec | RecorderSpec]:
         """Every process' spec, with endpoints that are reserved for it."""
-        design, folder, run = self._design, self._folder, secrets.token_hex(4)
+        design, folder, wires = self._design, self._folder, self._wiring.wires()
         ids = sorted(design.nodes)
-        at = {i: self._reserve() for i in ids}
-        plant = self._reserve()
         specs: dict[str, NodeSpec | PlantSpec | RecorderSpec] = {
-            "plant": replace(
-                design.plant, wire=Wire(run, (plant,), ()), output=str(folder.rows("plant")), recorded=self._record
-            )
+            "plant": replace(design.plant, wire=wires["plant"], output=str(folder.rows("plant")), recorded=self._record)
         }
         for i, spec in design.nodes.items():
-            neighbours = sorted(set(spec.hears) | set(spec.tells))
-            dial = (plant, *(at[j] for j in neighbours if j < i))  # one link per edge: the later one dials
-            specs[f"node-{i}"] = replace(spec, wire=Wire(run, (at[i],), dial), output=str(folder.rows(f"node-{i}")))
+            who = f"node-{i}"
+            specs[who] = replace(spec, wire=wires[who], output=str(folder.rows(who)))
         if self._record:
             specs["recorder"] = RecorderSpec(
                 name=design.scenario.name,
@@ -99,18 +102,9 @@ class Launch:
                 truth=str(folder.rows("plant")),
                 estimates={i: str(folder.rows(f"node-{i}")) for i in ids},
                 unknown_inputs=reconstructs(design)[0],
-                # it dials everybody, so that nobody has to wait for it or misses it
-                wire=Wire(run, (), (plant, *(at[i] for i in ids))),
+                wire=wires["recorder"],
             )
         return specs
-
-    def _reserve(self) -> str:
-        """A free port of the loopback, kept bound (not listening) until the process that gets it listens there."""
-        s = socket.socket()
-        s.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        s.bind((LOOPBACK, 0))
-        self._held.append(s)
-        return f"tcp/{LOOPBACK}:{s.getsockname()[1]}"
 
     def go(self, show: Show, hold: Callable[[str], None] | None) -> None:
         """Start everybody and stay until plant and nodes are done. Raises RunError, or KeyboardInterrupt."""
@@ -127,8 +121,7 @@ class Launch:
                 rows = self._design.plant.steps * len(self._sizes)
                 self._supervisor.finish("recorder", CLOSING + rows / CLOSING_ROWS)
         finally:
-            for s in self._held:
-                s.close()
+            self._wiring.release()
 
     def _look(self, show: Show) -> int:
         """Show the progress; how many bytes all journals have grown to."""
@@ -165,18 +158,21 @@ def run(
     show: Show = ignore,
     hold: Callable[[str], None] | None = None,
     supervisor: Supervisor | None = None,
+    address: str = LOOPBACK,
 ) -> RunResult:
     """Run a design as real processes over Zenoh and gather its results into the run folder.
 
     ``out``: the folder (default runs/<name>/<UTC time>); ``hold`` is called with the live server's address when the
     nodes are done, and the server stays until it returns; ``supervisor``: one that was started earlier, to save its
-    start-up time. Raises RunError when a process is lost or a deadline passes; the folder then holds what there is.
+    start-up time; ``address``: where the processes listen. Raises RunError when a process is lost or a deadline passes
+    (the folder then holds what there is), ScenarioError when they may not listen there.
     """
     scenario = design.scenario
+    check_address(address, scenario.security)
     with Supervisor() if supervisor is None else contextlib.nullcontext(supervisor) as supervisor:
         folder = RunFolder.create(scenario.name, out)
         write_inputs(folder, design)
-        launch = Launch(design, folder, supervisor, record=record, live=live)
+        launch = Launch(design, folder, supervisor, record=record, live=live, address=address)
         begin = time.monotonic()
         failed = ""
         try:
@@ -189,6 +185,8 @@ def run(
         finally:
             with contextlib.suppress(RunError):  # a nursery that died has taken everybody along
                 supervisor.end()
+            if not scenario.security.keep:
+                credentials.remove(folder.keys)
             result = gather(folder, design, supervisor, time.monotonic() - begin, failed)
     if failed:
         raise RunError(f"{failed} (what there is of the run is in {folder.root})")

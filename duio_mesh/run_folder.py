@@ -4,6 +4,7 @@ scenario.yaml  certificate.json  trace.npz  recording.rrd  metrics.json     writ
 nodes/node-3.spec  nodes/plant.spec  nodes/recorder.spec                    what each process was given (mode 0600)
 logs/node-3.jsonl  logs/node-3.err                                          events; whatever went to stderr
 rows/node-3.f64    rows/plant.f64                                           removed once trace.npz holds them
+keys/node-3/key.pem  ...                                                    removed at the end (mode 0600 until then)
 """
 
 from __future__ import annotations
@@ -53,6 +54,11 @@ class RunFolder:
     def spec(self, who: str) -> Path:
         """The spec file of a process."""
         return self.root / "nodes" / f"{who}.spec"
+
+    @property
+    def keys(self) -> Path:
+        """The credentials of a run that is not open; removed with it unless they are to be kept."""
+        return self.root / "keys"
 
     def rows(self, who: str) -> Path:
         """The journal of a process."""

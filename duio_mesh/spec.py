@@ -21,7 +21,24 @@ from duio_mesh.faults import UNDISTURBED, Incoming, Rule
 
 START = 30.0  # seconds for all processes of a run to find each other
 
+# the files in a process' folder of credentials
+USERS, PASSWORD = "users", "password"
+AUTHORITY, CERTIFICATE, KEY = "authority.pem", "certificate.pem", "key.pem"
+
 Signals: TypeAlias = tuple[Any, ...]  # plain data: see duio_mesh.dynamics.signal
+
+
+@dataclasses.dataclass(frozen=True)
+class Guard:
+    """Who may speak to this process and to whom it speaks, by names of processes; see duio_mesh.mesh.security."""
+
+    mode: str  # password | mtls
+    who: str  # this process
+    folder: str  # its own credentials, and nobody else's
+    hears: tuple[str, ...]  # processes that have something to tell it
+    tells: tuple[str, ...]  # processes to which it has something to tell
+    dials: tuple[str, ...]  # processes that it connects to; the others connect to it
+    limit: int  # bytes of the largest payload that it accepts
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,6 +48,7 @@ class Wire:
     run: str  # the run's name on the wire, unique per run
     listen: tuple[str, ...]  # Zenoh endpoints, e.g. tcp/127.0.0.1:7447
     connect: tuple[str, ...]
+    guard: Guard | None = None  # None: whoever reaches a port may speak
 
 
 UNWIRED = Wire("", (), ())
@@ -114,7 +132,7 @@ class RecorderSpec:
 Spec = TypeVar("Spec", NodeSpec, PlantSpec, RecorderSpec)
 
 _TYPES: dict[str, type[Any]] = {
-    t.__name__: t for t in (Wire, Rule, Incoming, NodeSpec, SensorSpec, PlantSpec, RecorderSpec)
+    t.__name__: t for t in (Guard, Wire, Rule, Incoming, NodeSpec, SensorSpec, PlantSpec, RecorderSpec)
 }
 _ARRAY, _RECORD = 1, 2  # msgpack extension codes
 

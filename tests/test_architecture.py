@@ -31,7 +31,7 @@ FLOORS = [
     ],
     ["report", "process"],
     ["synthesis", "simulation", "node", "plant", "recorder"],
-    ["nursery", "supervisor", "run_folder", "schema"],
+    ["nursery", "supervisor", "run_folder", "schema", "credentials", "wiring"],
     ["launcher"],
     ["api", "console", "generate"],
     ["cli"],
@@ -45,7 +45,13 @@ OUTSIDE = {  # what a room may import from outside the standard library
     "node": {"numpy"},
     "scenario": {"numpy", "pydantic", "pydantic_core", "ruamel"},
 }
-ONLY = {"zenoh": {"mesh"}, "rerun": {"report"}, "cvxpy": {"synthesis"}, "pydantic": {"scenario", "synthesis", "schema"}}
+ONLY = {
+    "zenoh": {"mesh"},
+    "rerun": {"report"},
+    "cvxpy": {"synthesis"},
+    "pydantic": {"scenario", "synthesis", "schema"},
+    "cryptography": {"credentials"},
+}
 
 
 def room(path_or_module: str) -> str:

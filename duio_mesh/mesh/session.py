@@ -27,6 +27,7 @@ import zenoh
 
 from duio_mesh.arrays import Array
 from duio_mesh.errors import RunError
+from duio_mesh.mesh import security
 from duio_mesh.mesh.frames import Decoder, Encoder, Frame, Rejected
 from duio_mesh.mesh.keys import Keys
 from duio_mesh.spec import START, Wire
@@ -50,6 +51,7 @@ def _config(wire: Wire) -> zenoh.Config:
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
         "transport/shared_memory/enabled": False,
+        **security.settings(wire),
     }
     for key, value in settings.items():
         config.insert_json5(key, json.dumps(value))

@@ -68,13 +68,24 @@ def _scenario(document: dict[str, Any], problems: Problems, options_of: OptionsO
     method, options = _observer(document["observer"], problems, options_of) if "observer" in document else ("", None)
     settings = _run(run, len(nodes or ()) * (parts.states.number if parts.states else 0), problems)
     faults = read_faults(document.get("faults"), graph, run.get("seed", 0), problems)
+    security = _security(document, problems)
     if problems or parts.plant is None or nodes is None or graph is None or settings is None:
         return None
     resolved = copy.deepcopy(document)
     resolved["run"]["seed"] = settings.seed
     sound = {i: node for i, node in nodes.items() if node is not None}
     return model.Scenario(
-        heading["name"], heading["description"], parts.plant, method, options, sound, graph, settings, resolved, faults
+        heading["name"],
+        heading["description"],
+        parts.plant,
+        method,
+        options,
+        sound,
+        graph,
+        settings,
+        resolved,
+        faults,
+        security,
     )
 
 
@@ -107,6 +118,16 @@ def _observer(written: Any, problems: Problems, options_of: OptionsOf) -> tuple[
         options = {key: value for key, value in written.items() if key != "method"}
         return str(method), whole(options_of(str(method)), options, path, problems)
     return "", None
+
+
+def _security(document: dict[str, Any], problems: Problems) -> model.Security:
+    """Who may speak: a mode, or a mapping with one."""
+    if document.get("security") is None:
+        return model.OPEN
+    written = fields(schema.Protected, {"security": document["security"]}, (), problems).get("security", "open")
+    if isinstance(written, schema.Security):
+        return model.Security(written.mode, written.keep, written.exposed)
+    return model.Security(written)
 
 
 def _run(run: dict[str, Any], numbers: int, problems: Problems) -> model.Run | None:

@@ -154,6 +154,17 @@ class Run:
     batch: int = 1  # steps whose fusion travels as one block; estimates then come that many steps late
 
 
+class Security(NamedTuple):
+    """Who may speak to the processes of a run (docs/security.md)."""
+
+    mode: Literal["open", "password", "mtls"] = "open"
+    keep: bool = False  # the credentials stay in the run folder
+    exposed: bool = False  # an open run may listen where strangers can reach it
+
+
+OPEN = Security()
+
+
 @dataclass(frozen=True)
 class Scenario:
     """A whole topology file, resolved."""
@@ -168,6 +179,7 @@ class Scenario:
     run: Run
     document: Mapping[str, Any] = field(repr=False)  # the resolved file as plain data: what scenario.yaml is made of
     faults: Faults = NO_FAULTS
+    security: Security = OPEN
 
     def known(self, i: int) -> Array:
         """B_i (n, m_i): columns of B whose inputs node i is told, in the order of ``plant.inputs``."""

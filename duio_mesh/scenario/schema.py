@@ -15,7 +15,7 @@ from duio_mesh.faults import MAX_DELAY
 from duio_mesh.scenario.problems import listed
 from duio_mesh.scenario.strict import Strict
 
-RESERVED = dict.fromkeys(("timing", "security", "hosts"), "is reserved for a later version of duio_mesh")
+RESERVED = dict.fromkeys(("timing", "hosts"), "is reserved for a later version of duio_mesh")
 """Top-level keys that no version accepts yet; to accept one, give it a field in Topology and delete it here."""
 
 MAX_STATES = 2000
@@ -320,6 +320,31 @@ class Faults(Strict):
     nodes: Annotated[list[NodeFault], Field(default_factory=list)]
 
 
+Mode: TypeAlias = Literal["open", "password", "mtls"]
+
+
+class Security(Strict):
+    """Who may speak to the processes of a run."""
+
+    mode: Mode
+    keep: Annotated[bool, Field(description="leave the credentials in the run folder")] = False
+    exposed: Annotated[bool, Field(description="an open run may listen beyond this host")] = False
+
+    @model_validator(mode="after")
+    def _fit(self) -> Security:
+        if self.exposed and self.mode != "open":
+            raise _misfit(f"belongs to the mode open; {self.mode} may listen beyond this host anyway", at="exposed")
+        if self.keep and self.mode == "open":
+            raise _misfit("belongs to password and mtls; an open run has no credentials", at="keep")
+        return self
+
+
+class Protected(Strict):
+    """Everything by its mode alone, or a mapping."""
+
+    security: Annotated[Mode | Security, Field(description="who may speak")] = "open"
+
+
 class Heading(Strict):
     """What a topology is called."""
 
@@ -327,7 +352,7 @@ class Heading(Strict):
     description: Annotated[str, Field(max_length=10_000)] = ""
 
 
-class Topology(Heading):
+class Topology(Heading, Protected):
     """A whole topology file. ``observer`` holds ``method`` and that method's own options."""
 
     plant: str | Plant

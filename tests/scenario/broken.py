@@ -169,9 +169,9 @@ TOP = [
     case("description is a list", ("description: Two states, two nodes", "description: §[1]"), words="should be text"),
     case("unknown top key", ("graph:", "§grahp:"), ("name: tiny", "§name: tiny"),
          words=("graph: is missing", "grahp: unknown key (did you mean graph?)")),
-    case("security", ("run:", "§security: {open: 1}\nrun:"), words="security: is reserved for a later version"),
-    case("timing, security, hosts", ("run:", "§timing: {}\n§security: {}\n§hosts: {}\nrun:"),
-         words=("timing: is reserved", "security: is reserved", "hosts: is reserved")),
+    case("timing", ("run:", "§timing: realtime\nrun:"), words="timing: is reserved for a later version"),
+    case("timing, hosts", ("run:", "§timing: {}\n§hosts: {}\nrun:"),
+         words=("timing: is reserved", "hosts: is reserved")),
     case("sections missing", ("name: tiny", "§§§name: tiny"), (without("plant:", "observer:"), ""),
          (without("nodes:", "graph:"), ""), (VALID[VALID.index("run:") :], ""),
          words=("plant: is missing", "nodes: is missing", "run: is missing")),
@@ -483,6 +483,25 @@ FAULTS = [
     faulty("faulty seed", "{seed: §-1}", "faults.seed: should be at least 0, not -1"),
 ]
 
+def guarded(name: str, security: str, words: str | tuple[str, ...]) -> Case:
+    """The valid file with this security."""
+    return case(name, ("run:", f"security: {security}\nrun:"), words=words)
+
+
+SECURITY = [
+    guarded("no such mode", "§tls", "should be 'open', 'password' or 'mtls' or a mapping, not the text 'tls' (did you"),
+    guarded("security is true", "§true", "security: should be"),
+    guarded("security is a number", "§1", "security: should be"),
+    guarded("security is a list", "§[mtls]", "security: should be"),
+    case("security without a mode", ("run:", "§security: {keep: true}\nrun:"), words="security.mode: is missing"),
+    guarded("no such mode in a mapping", "{mode: §mtsl}", "did you mean mtls?"),
+    guarded("misspelt keep", "{mode: mtls, §keeep: true}", "security.keeep: unknown key (did you mean keep?)"),
+    guarded("a password in the file", "{mode: password, §password: secret}", "security.password: unknown key"),
+    guarded("keep is text", "{mode: mtls, keep: §'yes'}", "security.keep: should be true or false"),
+    guarded("exposed with certificates", "{mode: mtls, §exposed: true}", "belongs to the mode open"),
+    guarded("keep nothing", "{mode: open, §keep: true}", "an open run has no credentials"),
+]
+
 CASES: list[Case] = [
-    *SYNTAX, *NUMBERS, *TOP, *PLANT, *DRIVES, *OBSERVER, *NODES, *GRAPH, *RUN, *FAULTS, *BY_FILE, *MANY
+    *SYNTAX, *NUMBERS, *TOP, *PLANT, *DRIVES, *OBSERVER, *NODES, *GRAPH, *RUN, *FAULTS, *SECURITY, *BY_FILE, *MANY
 ]
