@@ -58,11 +58,18 @@ def errors_in_words(errors: Mapping[int, float]) -> str:
     return "  ".join(f"{name} e{i} {e:.1e}" for name, (e, i) in chosen)
 
 
-def hold(url: str) -> None:
-    """Keep the live server until the person has seen enough; at once where nobody is."""
-    if sys.stdin.isatty():
-        _err.print(f"still serving the recording: rerun {url}\npress Enter to end")
-        sys.stdin.readline()
+class Watcher:
+    """Tells the person where to watch live, and keeps the server until they have seen enough."""
+
+    def started(self, url: str) -> None:
+        """The live server is there."""
+        _err.print(f"watch live  rerun {url}", soft_wrap=True)
+
+    def ended(self, url: str) -> None:
+        """The run is over; returns when the server may go, at once where nobody is at the terminal."""
+        if sys.stdin.isatty():
+            _err.print(f"the run is over and still served at {url}; press Enter to end", soft_wrap=True)
+            sys.stdin.readline()
 
 
 def result(design: Design, result: RunResult, *, live: bool) -> None:

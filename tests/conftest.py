@@ -15,23 +15,21 @@ ROOT = Path(__file__).parent.parent
 TOPOLOGIES = ROOT / "topologies"
 
 
-def ours() -> list[psutil.Process]:
-    """Every process of a run (they carry ``duio-`` names) and every child of this one."""
+def started_in(folder: Path) -> list[psutil.Process]:
+    """Every other process that was started in this folder (the processes of a run inherit it)."""
     found = []
-    for p in psutil.process_iter(["name", "cmdline"]):
-        named = (p.info["name"] or "").startswith("duio-") or any("duio_mesh" in a for a in p.info["cmdline"] or [])
-        if named and p.pid != os.getpid() and p.status() != psutil.STATUS_ZOMBIE:
+    for p in psutil.process_iter(["cwd", "status"]):
+        here = Path(p.info["cwd"] or "/").is_relative_to(folder)
+        if here and p.pid != os.getpid() and p.info["status"] != psutil.STATUS_ZOMBIE:
             found.append(p)
     return found
 
 
 @pytest.fixture
-def nothing_left() -> Iterator[None]:
+def nothing_left(tmp_path: Path) -> Iterator[None]:
     """Fails the test when a process of a run outlives it by more than the five seconds that an end may take."""
-    before = {p.pid for p in ours()}
     yield
-    left = [p for p in ours() if p.pid not in before]
-    _, left = psutil.wait_procs(left, timeout=5)
+    _, left = psutil.wait_procs(started_in(tmp_path), timeout=5)
     names = [p.name() for p in left]
     for p in left:
         p.kill()
