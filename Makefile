@@ -27,8 +27,11 @@ types: $(VENV)/tests ## mypy, strict
 schema: $(VENV)/ready ## rewrite the JSON schema that editors use for topology files
 	$(PY) -m duio_mesh.schema topologies/schema.json
 
-bench: $(VENV)/tests ## speed, as ratios inside one interleaved run; the tables of docs/performance.md
-	$(PY) bench/exchange.py
+bench: $(VENV)/ready ## speed, as ratios inside one interleaved run; the tables of docs/performance.md
+	-$(PY) -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[bench]'
+	$(PY) bench/exchange.py --repeat 3
+	$(PY) bench/admm.py
+	$(PY) bench/startup.py
 
 clean: ## remove the virtual environment and caches, keep runs/
 	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -51,9 +51,14 @@ def table(title: str, results: Results, reference: str, unit: str, number: str =
         ratio = "-"
         if isinstance(base, list):
             ratios = [a / b for a, b in zip(values, base, strict=True)]
-            ratio = f"{statistics.median(ratios):.2f} [{min(ratios):.2f} - {max(ratios):.2f}]"
+            middle, least, most = (_short(x) for x in (statistics.median(ratios), min(ratios), max(ratios)))
+            ratio = f"{middle} [{least} - {most}]"
         lines.append(f"| {name} | {number.format(statistics.median(values))} | {ratio} |")
     return "\n".join(lines) + "\n"
+
+
+def _short(ratio: float) -> str:
+    return f"{ratio:.2f}" if ratio >= 0.1 else f"{ratio:.2g}"
 
 
 def machine() -> str:
