@@ -8,7 +8,7 @@ from scipy import linalg
 
 from duio_mesh.errors import DesignError
 from duio_mesh.synthesis.consensus import Undetectable, couple
-from duio_mesh.synthesis.eigenvalue import Pencil, minimise_largest_eigenvalue
+from duio_mesh.synthesis.pencil import Pencil
 
 
 def random_network(seed, m=4, n=4, directed=False):
@@ -95,13 +95,51 @@ def test_a_lone_node_and_nodes_without_an_undetectable_part():
     assert one.beta == pytest.approx(0.05**2 - 1)
 
 
-def test_least_largest_eigenvalue_in_closed_form():
-    # lambda_max of [[1 + 2x, 0, 0], [0, 3 - 2x, 0], [0, 0, -5]] is least, 2, at x = 1/2
-    pencil = Pencil(np.diag([1.0, 3.0, -5.0]), np.eye(3)[:, :2], np.diag([1.0, -1.0, 0.0])[:, :2], (2,))
-    found = minimise_largest_eigenvalue(pencil)
-    assert found.x[0] == pytest.approx(0.5, abs=1e-6)
-    assert found.value == pytest.approx(2.0, abs=1e-7)
-    assert found.lower <= 2.0 + 1e-12
+@pytest.mark.parametrize("a", [0.3, 1.0, 2.0])
+def test_39_in_closed_form(a):
+    """One mode a: gamma = a^2 - 2 a g + g^2 / gamma is least, a^2 / (1 + a^2), at g = a gamma."""
+    one, nothing = Undetectable(np.array([[a]]), np.eye(2)[:, :1]), Undetectable(np.zeros((0, 0)), np.zeros((2, 0)))
+    found = couple([one, nothing], np.array([[1.0, -1.0], [-1.0, 1.0]]), "paper")
+    assert found.g[0] == pytest.approx(a**3 / (1 + a**2), abs=1e-6)
+    assert found.beta == pytest.approx(-1 / (1 + a**2), abs=1e-7)
+    assert found.lower <= -1 / (1 + a**2) + 1e-12
+
+
+@pytest.mark.parametrize("criterion", ["paper", "norm"])
+def test_derivatives_of_the_barrier(criterion):
+    """Against differences of log det of S, written out in full."""
+    parts, laplacian = random_network(4, directed=True)
+    pencil = Pencil([p.A for p in parts], [p.U for p in parts], laplacian, criterion)
+    rng = np.random.default_rng(0)
+    U, A, n = linalg.block_diag(*[p.U for p in parts]), linalg.block_diag(*[p.A for p in parts]), len(parts[0].U)
+
+    def barrier(z):
+        Theta = U.T @ np.kron(np.diag(z[:-1]) @ laplacian, np.eye(n)) @ U
+        if criterion == "norm":
+            F = np.block([[np.zeros_like(A), (A - Theta).T], [A - Theta, np.zeros_like(A)]])
+        else:
+            F = np.block([[A.T @ A - A.T @ Theta - Theta.T @ A, Theta.T], [Theta, np.zeros_like(A)]])
+        sign, value = np.linalg.slogdet(z[-1] * np.eye(len(F)) - F)
+        assert sign > 0
+        return -value
+
+    g = 0.1 * rng.standard_normal(len(parts))
+    z = np.append(g, 1.3 * pencil.value(g) + 0.5)
+    factored = pencil.factor(z[:-1], z[-1])
+    assert -factored.log_det == pytest.approx(barrier(z))
+    gradient, hessian = pencil.derivatives(factored)
+    h, I = 1e-4, np.eye(len(z))
+    slopes = [(barrier(z + h * d) - barrier(z - h * d)) / (2 * h) for d in I]
+    np.testing.assert_allclose(gradient, slopes, atol=1e-5 * np.abs(gradient).max())
+    bends = [
+        [
+            (barrier(z + h * (a + b)) - barrier(z + h * (a - b)) - barrier(z - h * (a - b)) + barrier(z - h * (a + b)))
+            / (4 * h * h)
+            for b in I
+        ]
+        for a in I
+    ]
+    np.testing.assert_allclose(hessian, bends, atol=1e-4 * np.abs(hessian).max())
 
 
 def test_scales_far_apart():
