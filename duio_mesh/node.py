@@ -20,6 +20,7 @@ from duio_mesh.mesh import Mesh
 from duio_mesh.mesh.lockstep import Exchange, Line, Lockstep
 from duio_mesh.observers import make_observer
 from duio_mesh.observers.base import reader
+from duio_mesh.observers.watch import watcher
 from duio_mesh.process import Report, main
 from duio_mesh.spec import NodeSpec
 
@@ -37,6 +38,8 @@ def _samples(lockstep: Lockstep, plant: Line, spec: NodeSpec) -> Iterator[Array]
 
 def run(spec: NodeSpec, report: Report) -> None:
     """Run one node for ``spec.steps`` steps. Raises RunError when a neighbour or the plant is lost or late."""
+    if spec.faults.rules:
+        raise RunError(f"node-{spec.id}: faults can be run with --in-process only so far")
     i, p, window = spec.id, spec.p, spec.window
     observer = make_observer(spec)
     with Mesh(spec.wire, f"node-{i}", report.warn) as mesh:
@@ -54,7 +57,8 @@ def run(spec: NodeSpec, report: Report) -> None:
         row = sum(part.size for part in observer.estimate())
         zeros = np.zeros(spec.n)
         estimates, samples = reader(observer), _samples(lockstep, plant, spec)
-        rounds, promised, begin = 0, spec.credit, time.monotonic()
+        watched = watcher(observer)
+        rounds, promised, begin, cpu = 0, spec.credit, time.monotonic(), time.process_time()
         beat = begin + BEAT
         with lockstep, Journal(spec.output, row, trace) as journal:
             for k in range(0, spec.steps, spec.batch):
@@ -69,6 +73,8 @@ def run(spec: NodeSpec, report: Report) -> None:
                         beat = now + BEAT
                         credit.send(k, 0, NO_VECTOR)
                         report.beat()
+                if len(figures := watched()):
+                    journal.aside(spec.options["watch_step"], figures)
                 for estimate in estimates():
                     if not isfinite(zeros.dot(estimate.state)):
                         raise RunError(f"node-{i}: the estimate overflowed at step {k}; is the plant unstable?")
@@ -81,7 +87,7 @@ def run(spec: NodeSpec, report: Report) -> None:
             steps=spec.steps,
             rounds=rounds,
             seconds=time.monotonic() - begin,
-            cpu_seconds=time.process_time(),
+            cpu_seconds=time.process_time() - cpu,
             frames=told.frames,
             rejected=mesh.rejections(),
         )

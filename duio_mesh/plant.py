@@ -75,7 +75,7 @@ def run(spec: PlantSpec, report: Report) -> None:
         if spec.recorded and mesh.unanswered(RECORDER):  # it then reads what it missed from the journals
             report.warn(f"the recorder was not there after {RECORDER:g} s; starting without it")
         report("ready")
-        credits, begin = Credits(mesh, nodes, spec), time.monotonic()
+        credits, begin, cpu = Credits(mesh, nodes, spec), time.monotonic(), time.process_time()
         with Journal(spec.output, plant.x.size, truth) as journal:
             for k in range(0, spec.steps, spec.block):
                 block = range(k, min(k + spec.block, spec.steps))
@@ -96,7 +96,7 @@ def run(spec: PlantSpec, report: Report) -> None:
             "done",
             steps=spec.steps,
             seconds=time.monotonic() - begin,
-            cpu_seconds=time.process_time(),
+            cpu_seconds=time.process_time() - cpu,
             frames=frames,
             rejected=mesh.rejections(),
         )

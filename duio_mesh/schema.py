@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import sys
 from collections.abc import Sequence
@@ -17,13 +18,16 @@ def text() -> str:
     return json.dumps(editor_schema({method: options_of(method) for method in METHODS}), indent=2) + "\n"
 
 
-def main(argv: Sequence[str]) -> None:
+def main(argv: Sequence[str] | None = None) -> None:
     """Print the schema, or write it to the file that is named."""
-    if argv:
-        Path(argv[0]).write_text(text(), encoding="utf-8")
+    parser = argparse.ArgumentParser(description="The JSON schema of topology files, for editors.")
+    parser.add_argument("file", nargs="?", type=Path, help="where to write it (default: standard output)")
+    file = parser.parse_args(argv).file
+    if file:
+        file.write_text(text(), encoding="utf-8")
     else:
         sys.stdout.write(text())
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    main()

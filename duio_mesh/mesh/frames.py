@@ -75,8 +75,8 @@ class Encoder:
         self._prefix = prefix(run, source)
 
     def __call__(self, k: int, r: int, vector: Array) -> bytes:
-        """The frame of step k, round r; ``vector`` is float64 in C order (a block of rows goes row by row)."""
-        payload = vector.astype(FLOAT64, copy=False).tobytes()
+        """The frame of step k, round r; ``vector`` is little-endian float64 (a block of rows goes row by row)."""
+        payload = vector.tobytes()
         body = self._prefix + stamp(k, r, len(payload)) + payload + _BIN8_OF_4
         return body + _CHECK.pack(crc32(body))
 

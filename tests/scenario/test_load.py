@@ -49,7 +49,7 @@ def test_every_part_arrives(tmp_path: Path) -> None:
     assert s.nodes[1].noise.signals == (({"normal": {"mean": 0.0, "std": 0.1}},),)
     assert s.graph.arcs == (Arc(1, 2, 1.0), Arc(2, 1, 1.0))
     assert not s.graph.directed
-    assert (s.run.steps, s.run.seed, s.run.deadline, s.run.window) == (10, 0, 5.0, 64)
+    assert (s.run.steps, s.run.seed, s.run.deadline, s.run.window) == (10, 0, 5.0, 256)
     assert s.run.convergence == (0.5, 0.5)
     assert s.options.decomposition == "observability"
     for array in (s.plant.A, s.plant.B, s.plant.E, s.nodes[1].C):
