@@ -208,6 +208,7 @@ class Arrivals(NamedTuple):
     """What reaches a node in one exchange."""
 
     on_time: tuple[int, ...]  # in-neighbours whose frame of this very step and round arrives, ascending
+    held: tuple[int, ...]  # in-neighbours whose frame of this step and round arrives in a later exchange
     late: tuple[Stamp, ...]  # older frames that arrive now, oldest first
 
 
@@ -229,7 +230,7 @@ class Reception:
 
         A frame that is late by s steps and d rounds arrives in the d-th exchange after that of step k + s, round r.
         """
-        on_time = []
+        on_time, held_back = [], []
         for j, edge in self._edges.items():
             fate = FINE if edge is None else edge.fate(k, r)
             self.counts["lost"] += fate.lost
@@ -237,10 +238,11 @@ class Reception:
             self.counts["duplicate"] += fate.arrives and fate.duplicate
             if fate.arrives and fate.late:
                 self._held.append(_Held(Stamp(j, k, r), k + fate.steps, fate.rounds))
+                held_back.append(j)
                 self.counts["late"] += 1
             elif fate.arrives:
                 on_time.append(j)
-        late = []
+        late: list[Stamp] = []
         for held in list(self._held):
             if held.tick is None and (k, r) >= (held.step, held.stamp.r):
                 held.tick = self._tick + held.rounds
@@ -248,7 +250,7 @@ class Reception:
                 self._held.remove(held)
                 late.append(held.stamp)
         self._tick += 1
-        return Arrivals(tuple(on_time), tuple(sorted(late, key=lambda s: (s.k, s.r, s.source))))
+        return Arrivals(tuple(on_time), tuple(held_back), tuple(sorted(late, key=lambda s: (s.k, s.r, s.source))))
 
 
 @dataclass

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 
 import numpy as np
 
 from duio_mesh.arrays import Array
 from duio_mesh.dynamics import Plant
+from duio_mesh.faults import Reception, Stamp
 from duio_mesh.observers import make_observer
+from duio_mesh.observers.absence import Late, flagged, take_late
 from duio_mesh.observers.base import reader
+from duio_mesh.spec import NodeSpec
 from duio_mesh.synthesis.design import Design
 from duio_mesh.trace import Trace as Trace  # re-exported: it lives lower, where report/ may import it
 
@@ -18,7 +22,8 @@ def simulate(design: Design, progress: Callable[[int], None] = lambda _: None) -
     """Run plant and observers in lockstep; ``progress`` is called with the number of finished steps."""
     plant = Plant(design.plant)
     observers = {i: make_observer(spec) for i, spec in design.nodes.items()}
-    truth, rows = [], {i: list[Array]() for i in observers}
+    network = {i: _InEdges(spec) for i, spec in design.nodes.items()}
+    truth, rows, marks = [], {i: list[Array]() for i in observers}, {i: list[bool]() for i in observers}
     steps, batch = design.plant.steps, design.scenario.run.batch
     for k in range(0, steps, batch):
         done = min(k + batch, steps)
@@ -34,11 +39,33 @@ def simulate(design: Design, progress: Callable[[int], None] = lambda _: None) -
             turn = {i: o for i, o in observers.items() if r < rounds[i]}
             sent = {i: o.message(r).copy() for i, o in turn.items()}
             for i, observer in turn.items():
-                observer.exchange(r, {j: sent[j] for j in design.nodes[i].hears})
+                received, late = network[i].next(k, r, sent)
+                take_late(observer, late)
+                observer.exchange(r, received)
         for i, observer in observers.items():
+            marks[i] += [flagged(observer)] * (done - k)
             rows[i] += [np.concatenate(estimate) for estimate in reader(observer)()]
         progress(done)
-    return split_trace(design, np.array(truth), {i: np.array(r) for i, r in rows.items()})
+    trace = split_trace(design, np.array(truth), {i: np.array(r) for i, r in rows.items()})
+    return replace(trace, flagged=np.array([marks[int(i)] for i in trace.node_ids]))
+
+
+class _InEdges:
+    """What reaches one node, as the faults of its in-edges will have it."""
+
+    def __init__(self, spec: NodeSpec) -> None:
+        self._hears = tuple(sorted(spec.hears))
+        self._reception = Reception(spec.faults, spec.hears) if spec.faults.rules else None
+        self._held: dict[Stamp, Array] = {}
+
+    def next(self, k: int, r: int, sent: Mapping[int, Array]) -> tuple[dict[int, Array], list[Late]]:
+        """The vectors of step k, round r that arrive in this very exchange, and older ones that arrive now."""
+        if self._reception is None:
+            return {j: sent[j] for j in self._hears}, []
+        on_time, held, late = self._reception.next(k, r)
+        arrived = [Late(s.source, k - s.k, s.r, self._held.pop(s)) for s in late]
+        self._held |= {Stamp(j, k, r): sent[j] for j in held}
+        return {j: sent[j] for j in on_time}, arrived
 
 
 def split_trace(design: Design, x: Array, rows: dict[int, Array]) -> Trace:

@@ -20,6 +20,8 @@ class Trace:
     xhat: Array  # (N, K, n), xhat[i, k] estimates x[k]
     what: Array | None = None  # (N, K, q) where the method reconstructs the unknown input
     vhat: dict[int, Array] = field(default_factory=dict)  # node id -> (K, r) where it reconstructs its noise
+    flagged: NDArray[np.bool_] | None = None
+    """(N, K) estimates that the node itself marks as not to be trusted; only the oracle keeps them so far."""
 
     def arrays(self) -> dict[str, NDArray[np.generic]]:
         """The arrays under the names of trace.npz."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 
 from duio_mesh.methods import METHODS
+from duio_mesh.observers.absence import guarded
 from duio_mesh.observers.base import Estimate, Observer
 from duio_mesh.spec import NodeSpec
 
@@ -16,4 +17,4 @@ def make_observer(spec: NodeSpec) -> Observer:
     if spec.method not in METHODS:
         raise ValueError(f"unknown observer method {spec.method!r}; known: {', '.join(METHODS)}")
     observer: Observer = importlib.import_module(f"duio_mesh.observers.{spec.method}").Observer(spec)
-    return observer
+    return guarded(observer, spec)

@@ -26,6 +26,10 @@ def synthesise(scenario: Scenario, progress: Callable[[str], None] = lambda _: N
     ``progress`` is called with a short sentence before each long piece of work.
     Raises DesignError when a condition fails or no gains exist; the message says which, where and by how much.
     """
+    if scenario.faults.nodes:
+        raise DesignError(
+            "faults.nodes: kill, pause and restart cannot be carried out yet; take them out (links and cuts can)"
+        )
     observer = importlib.import_module(f"duio_mesh.observers.{scenario.method}").Observer
     if (batch := scenario.run.batch) > 1 and not can_batch(observer):
         raise DesignError(

@@ -109,6 +109,9 @@ def _spec(scenario: Scenario, i: int, local: Local, island: Island) -> NodeSpec:
 def _certificate(
     options: Options, nodes: Mapping[int, Local], islands: Mapping[int, Island], described: list[dict[str, Any]]
 ) -> dict[str, Any]:
+    predicts = options.without == "predict" or (options.without == "auto" and options.fusion == "finite_time")
+    if scenario.faults.links and predicts:
+        matrices |= {"A": scenario.plant.A, "B": scenario.known(i)}
     """``spectral_radius`` is that of the error from step to step, which lives in the local estimates alone.
 
     The fusion starts afresh in every step and remembers nothing: after exact fusion the error of every node is

@@ -45,6 +45,9 @@ class Options(Strict):
     poles: tuple[Annotated[float, Field(gt=-1, lt=1)], ...] | None = None
     """Where a node puts the eigenvalues of its local estimate that are free; by default a Kalman-type gain decides."""
 
+    without: Literal["auto", "hold", "predict"] = "auto"
+    """Under faults, in a step that misses messages: hold the newest, or predict from the step before; both flag it."""
+
     @model_validator(mode="after")
     def _no_idle_option(self) -> Options:
         for fusion, names in _USED.items():

@@ -8,6 +8,7 @@ from pydantic import Field
 
 from duio_mesh.scenario.schema import Matrix, OneOf
 from duio_mesh.scenario.strict import Strict
+from duio_mesh.synthesis.absence import Absence
 
 Order: TypeAlias = Annotated[int, Field(ge=0, le=1000)]
 
@@ -81,7 +82,7 @@ class Method(OneOf):
 _DEFAULTS: dict[str, H2 | BraschPearson | Channel] = {"h2": H2(), "brasch_pearson": BraschPearson(), "lqg": Channel()}
 
 
-class Options(Strict):
+class Options(Absence):
     """The keys under ``observer:`` for ``method: augmented``."""
 
     gains: Literal["h2", "brasch_pearson", "lqg"] | Method = "h2"

@@ -22,6 +22,7 @@ from duio_mesh.geometry import (
 from duio_mesh.scenario.model import Scenario
 from duio_mesh.scenario.strict import Strict
 from duio_mesh.spec import NodeSpec
+from duio_mesh.synthesis.absence import Absence
 from duio_mesh.synthesis.consensus import Coupling, Undetectable, couple
 from duio_mesh.synthesis.design import Design, Progress, node_spec, plant_spec
 from duio_mesh.synthesis.lmi_network import Local, Network, certificate
@@ -46,7 +47,7 @@ class Poles(Strict):
         return self
 
 
-class Options(Strict):
+class Options(Absence):
     """The keys under ``observer:`` for ``method: lmi``."""
 
     decomposition: Literal["detectability", "observability"] = "detectability"

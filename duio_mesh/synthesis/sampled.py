@@ -17,7 +17,7 @@ from scipy import linalg
 
 from duio_mesh.arrays import Array
 from duio_mesh.errors import DesignError
-from duio_mesh.scenario.strict import Strict
+from duio_mesh.synthesis.absence import Absence
 
 Hold: TypeAlias = Literal["zero_order", "first_order", "quadratic"]
 
@@ -33,7 +33,7 @@ _ENOUGH = 0.95  # of the best decay rate: more coupling than that costs robustne
 _MARGIN = 1.5  # in the step
 
 
-class HoldOptions(Strict):
+class HoldOptions(Absence):
     """Options that every sampled continuous observer has."""
 
     hold: Hold = "first_order"

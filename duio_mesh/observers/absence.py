@@ -1,0 +1,249 @@
+"""What an observer does without a neighbour: its policy, and the mark that says when not to trust the estimate.
+
+Where messages can be missing, ``make_observer`` puts a guard around the method's own step machine. The guard decides
+what the machine is given in place of what did not come, and every message carries one number more: the sender's
+*doubt*, which tells nodes that have heard everybody that somebody else has not.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from duio_mesh.arrays import Array
+from duio_mesh.observers.base import Estimate, Observer, reader
+from duio_mesh.spec import NodeSpec
+
+PATIENCE = 5  # steps (relaxed fusion: rounds) without a neighbour that are bridged without a flag
+MISS = 3  # a neighbour that misses more than one in 1 + MISS exchanges is as good as silent
+HELD = 1000.0  # steps that the bias of a stale vector is taken to last
+MEMORY = 64  # own messages that are kept to be paired with late ones
+
+
+class Late(NamedTuple):
+    """A vector that arrives after the exchange that it was sent for."""
+
+    source: int
+    steps: int  # older than the present step by so many
+    round: int  # of its own step
+    vector: Array
+
+
+def take_late(observer: Observer, arrived: Sequence[Late]) -> None:
+    """Hand over late vectors, oldest first, before the same round's ``exchange``. Without a guard they are dropped."""
+    late: Callable[[Sequence[Late]], None] | None = getattr(observer, "late", None)
+    if arrived and late is not None:
+        late(arrived)
+
+
+def flagged(observer: Observer) -> bool:
+    """Whether the newest estimate is not to be trusted: messages were missing that the policy cannot replace."""
+    return bool(getattr(observer, "flagged", False))
+
+
+class Silence:
+    """How badly a node's neighbours are missed: one leaky account each.
+
+    An exchange without the neighbour adds MISS, one with it takes 1 away. What is above MISS * PATIENCE is the doubt:
+    the number of complete exchanges after which it is over, at most as many as were missed. Losses below a quarter
+    hardly ever reach it, and then briefly.
+    """
+
+    def __init__(self, ids: Iterable[int]) -> None:
+        self._level = dict.fromkeys(ids, 0)
+        self._missed = dict(self._level)  # exchanges since the account was last empty
+
+    def note(self, heard: Container[int]) -> float:
+        """After an exchange: the doubt about the worst neighbour."""
+        free = MISS * PATIENCE
+        for j, level in self._level.items():
+            if j in heard:
+                self._level[j] = max(0, level - 1)
+                self._missed[j] *= level > 1
+            else:
+                self._missed[j] += 1
+                self._level[j] = min(level + MISS, free + self._missed[j])
+        return float(max(0, max(self._level.values(), default=0) - free))
+
+
+class _Guard:
+    """A step machine of its own around another one; one number more per message."""
+
+    def __init__(self, inner: Observer, spec: NodeSpec) -> None:
+        self._inner, self._hears = inner, tuple(sorted(spec.hears))
+        self._policy = spec.without
+        self._doubt = 0.0  # what the next message says
+        self._late: list[Late] = []
+
+    @property
+    def rounds(self) -> int:
+        """As the method has."""
+        return self._inner.rounds
+
+    def message(self, r: int) -> Array:
+        """The method's vector, then the doubt."""
+        return np.append(self._inner.message(r), self._doubt)
+
+    def late(self, arrived: Sequence[Late]) -> None:
+        """Vectors of earlier exchanges that arrive in the coming one."""
+        self._late.extend(arrived)
+
+    def estimate(self) -> Estimate:
+        """As the method has."""
+        return self._inner.estimate()
+
+
+class Coupled(_Guard):
+    """Of the methods that exchange x-hat once per step and pull it towards the neighbours' (seeds 000, 001, 003, 004).
+
+    ``skip`` leaves the edge out of the step. ``hold`` takes the latest vector that ever came, which pulls to where the
+    plant was: flagged from the first time on. ``pair`` compares a late vector with the own one of the same step: it
+    adds that difference to the present own vector, so that the method sees just the difference; an edge with nothing
+    new is left out. A design without delays stands a small one in continuous time only (see docs/reliability.md), so a
+    vector that is more than ``paired`` steps late counts as missing all the same.
+
+    The estimate is flagged while ``Silence`` doubts a neighbour; who hears of a doubt of d steps has one of d - 1.
+    """
+
+    def __init__(self, inner: Observer, spec: NodeSpec) -> None:
+        super().__init__(inner, spec)
+        self._silence = Silence(self._hears)
+        self._paired = 1 if spec.method in ("geometric", "reduced_order") else 0
+        self._last: dict[int, tuple[int, Array]] = {}  # for hold: the newest vector and its age
+        self._said: deque[Array] = deque(maxlen=MEMORY)  # own vectors, newest first
+
+    @property
+    def flagged(self) -> bool:
+        """Is the newest estimate marked?"""
+        return self._doubt > 0
+
+    def sample(self, y: Array, u: Array) -> None:
+        """As the method does."""
+        self._inner.sample(y, u)
+
+    def exchange(self, r: int, received: Mapping[int, Array]) -> None:
+        """The method's exchange, with what the policy puts in place of what is missing."""
+        own = self._inner.message(r)
+        vectors = {j: vector[:-1] for j, vector in received.items()}
+        told = max((vector[-1] for vector in received.values()), default=0.0)
+        self._said.appendleft(own.copy())
+        usable = self._replaced(own, vectors)
+        timely = {late.source for late in self._late if self._policy == "pair" and late.steps <= self._paired}
+        self._late.clear()
+        stale = self._policy == "hold" and len(usable) > len(vectors)
+        silent = self._silence.note(vectors.keys() | timely)
+        self._doubt = max(silent, told - 1, self._doubt - 1, HELD if stale else 0.0, 0.0)
+        self._inner.exchange(r, usable)
+
+    def _replaced(self, own: Array, heard: dict[int, Array]) -> dict[int, Array]:
+        """The vectors that the method gets, in ascending order of id."""
+        found = dict(heard)
+        if self._policy == "hold":
+            self._last = {j: (age + 1, vector) for j, (age, vector) in self._last.items()}
+            for j, steps, _, vector in self._late:
+                if j not in self._last or steps < self._last[j][0]:
+                    self._last[j] = (steps, vector[:-1])
+            self._last |= {j: (0, vector) for j, vector in heard.items()}
+            found = {j: vector for j, (_, vector) in self._last.items()}
+        elif self._policy == "pair":
+            for j, steps, _, vector in self._late:  # oldest first: the newest stays
+                if j not in heard and steps < len(self._said):
+                    found[j] = own + (vector[:-1] - self._said[steps])
+        return {j: found[j] for j in self._hears if j in found}
+
+
+class Fused(_Guard):
+    """Of the method that fuses anew in every step (seed 002): nothing is carried over, one whole step is in doubt.
+
+    Within a step the newest vector of a neighbour stands for a missing one; before it was heard at all, it is taken
+    to agree with this node. ``hold`` gives the result as it comes out; ``predict`` gives A x-hat + B_i u_i of the step
+    before instead when the step is in doubt (it knows nothing of the unknown inputs, and stays flagged). ``auto`` is
+    predict for finite-time averaging, where a missing message leaves nothing of the result, and hold for the others.
+
+    Linearised ADMM and finite-time averaging need every message, so one that is missing anywhere makes the step
+    doubtful, and the doubt travels as fast as the harm, one hop per round. The relaxed fusion forgets what was lost: a
+    step is in doubt while ``Silence``, counting rounds, doubts a neighbour; it shrinks by one per round.
+    """
+
+    def __init__(self, inner: Observer, spec: NodeSpec) -> None:
+        super().__init__(inner, spec)
+        fusion, distributed = spec.options["fusion"], spec.options["setup"] == "distributed"
+        self._exact = fusion != "relaxed"
+        self._set_up = len(spec.options["eigenvalues"]) if distributed else 0  # rounds that forgive nothing
+        self._silence = Silence(self._hears)
+        self._newest: dict[int, tuple[int, Array]] = {}  # round and vector, of this step
+        self._results: list[Estimate] = []
+        self._inputs: list[Array] = []
+        self._before: Array | None = None  # the known inputs of the sample before this step's first
+        self._AB: Array | None = None
+        if self._policy == "predict" or (self._policy == "auto" and fusion == "finite_time"):
+            self._AB = np.hstack([spec.matrices["A"], spec.matrices["B"]])
+        self._x = np.zeros(spec.n)
+
+    @property
+    def flagged(self) -> bool:
+        """Are the newest estimates marked?"""
+        return self._doubt > 0
+
+    def sample(self, y: Array, u: Array) -> None:
+        """As the method does; the first sample after an estimate begins a step without doubt."""
+        if self._results:
+            self._x = self._results[-1].state.copy()
+            self._before = self._inputs[-1]
+            self._results, self._inputs, self._newest, self._doubt, self._set_up = [], [], {}, 0.0, 0
+            self._silence = Silence(self._hears)
+        self._inputs.append(u.copy())
+        self._inner.sample(y, u)
+
+    def exchange(self, r: int, received: Mapping[int, Array]) -> None:
+        """The method's exchange, with the newest vectors in place of missing ones."""
+        heard = {j: vector[:-1] for j, vector in received.items()}
+        if r < self._set_up:
+            self._late.clear()
+            self._inner.exchange(r, heard)
+            return
+        own = self._inner.message(r)
+        for j, steps, round_, vector in self._late:
+            if steps == 0 and round_ >= self._set_up and (j not in self._newest or round_ > self._newest[j][0]):
+                self._newest[j] = (round_, vector[:-1])
+        self._late.clear()
+        self._newest |= {j: (r, vector) for j, vector in heard.items()}
+        told = max((vector[-1] for vector in received.values()), default=0.0)
+        self._doubt = self._doubted(heard, told)
+        given = {j: self._newest[j][1] if j in self._newest else own for j in self._hears}
+        self._inner.exchange(r, given)
+
+    def _doubted(self, heard: Mapping[int, Array], told: float) -> float:
+        if self._exact:
+            return float(self._doubt or told or len(heard) < len(self._hears))
+        return max(self._silence.note(heard), told - 1, self._doubt - 1, 0.0)
+
+    def estimate(self) -> Estimate:
+        """Of the newest sample."""
+        return self._results[-1] if self.batch() else self._inner.estimate()
+
+    def batch(self) -> Sequence[Estimate]:
+        """Of every sample since the last rounds."""
+        if not self._results and self._inputs:
+            doubtful = self._AB is not None and self.flagged
+            found = self._predicted() if doubtful else [e.state.copy() for e in reader(self._inner)()]
+            self._results = [Estimate(x) for x in found]
+        return self._results
+
+    def _predicted(self) -> list[Array]:
+        """A x-hat + B_i u_i from the last step's estimate on, for every sample of this one."""
+        assert self._AB is not None  # noqa: S101
+        found = [self._x if self._before is None else self._AB @ np.append(self._x, self._before)]
+        for u in self._inputs[:-1]:
+            found.append(self._AB @ np.append(found[-1], u))
+        return found
+
+
+def guarded(inner: Observer, spec: NodeSpec) -> Observer:
+    """The observer with its guard, where messages can be missing; otherwise the observer itself."""
+    if not spec.without:
+        return inner
+    return Fused(inner, spec) if spec.method == "admm" else Coupled(inner, spec)
