@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import os
 import tempfile
 from collections.abc import Mapping
@@ -33,7 +34,7 @@ def admm_ring(count: int, steps: int, observer: Mapping[str, Any], **run: Any) -
         "name": f"admm-ring-{count}",
         "plant": yaml.load(TOPOLOGIES / example["plant"]),
         "observer": {"method": "admm", **observer},
-        "nodes": {i + 1: kinds[i % 4] for i in range(count)},
+        "nodes": {i + 1: copy.deepcopy(kinds[i % 4]) for i in range(count)},
         "graph": {"edges": [[i + 1, (i + 1) % count + 1] for i in range(count)]},
         "run": {"steps": steps, "seed": 0, "convergence": {"rms_below": 1.0, "over_last": 0.5}, **run},
     }

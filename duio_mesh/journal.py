@@ -17,6 +17,7 @@ if TYPE_CHECKING:  # the launcher reads journals and must not load Zenoh
 
 PERIOD = 0.05  # seconds between batches: a viewer's eye, and cheap
 BATCH_BYTES = 1 << 16
+ASIDE = 1  # the round of a frame that holds other rows than the journal's
 
 
 class Journal:
@@ -52,6 +53,12 @@ class Journal:
         if self._filled == len(self._rows) or time.monotonic() >= self._due:
             self.flush()
 
+    def aside(self, k: int, rows: Array) -> None:
+        """Pass on other rows, which belong to step k: to a file beside, and marked as ``ASIDE`` on the outlet."""
+        if self._file:
+            aside(self._file.name).write_bytes(rows.astype("<f8", copy=False).tobytes())
+        self._outlet.send(k, ASIDE, rows)
+
     def flush(self) -> None:
         """Pass on what is there."""
         self._due = time.monotonic() + PERIOD
@@ -64,6 +71,11 @@ class Journal:
         self._outlet.send(self._first, 0, rows)
         self._first += self._filled
         self._filled = 0
+
+
+def aside(path: str | Path) -> Path:
+    """Where the journal ``path`` has its rows of another kind."""
+    return Path(f"{path}.aside")
 
 
 def map_rows(path: str | Path, size: int) -> Array:

@@ -102,6 +102,7 @@ class Launch:
                 truth=str(folder.rows("plant")),
                 estimates={i: str(folder.rows(f"node-{i}")) for i in ids},
                 unknown_inputs=reconstructs(design)[0],
+                watch_step=getattr(design.scenario.options, "watch_step", None),
                 wire=wires["recorder"],
             )
         return specs

@@ -21,6 +21,7 @@ from duio_mesh.mesh.lockstep import Exchange, Line, Lockstep
 from duio_mesh.observers import make_observer
 from duio_mesh.observers.base import reader
 from duio_mesh.observers.watch import watcher
+from duio_mesh.observers.watch import watcher
 from duio_mesh.process import Report, main
 from duio_mesh.spec import NodeSpec
 
@@ -58,6 +59,7 @@ def run(spec: NodeSpec, report: Report) -> None:
         zeros = np.zeros(spec.n)
         estimates, samples = reader(observer), _samples(lockstep, plant, spec)
         watched = watcher(observer)
+        watched = watcher(observer)
         rounds, promised, begin, cpu = 0, spec.credit, time.monotonic(), time.process_time()
         beat = begin + BEAT
         with lockstep, Journal(spec.output, row, trace) as journal:
@@ -73,6 +75,8 @@ def run(spec: NodeSpec, report: Report) -> None:
                         beat = now + BEAT
                         credit.send(k, 0, NO_VECTOR)
                         report.beat()
+                if len(figures := watched()):
+                    journal.aside(spec.options["watch_step"], figures)
                 if len(figures := watched()):
                     journal.aside(spec.options["watch_step"], figures)
                 for estimate in estimates():

@@ -11,8 +11,9 @@ import time
 from contextlib import suppress
 from queue import Empty, SimpleQueue
 
-from duio_mesh.journal import PERIOD, map_rows
+from duio_mesh.journal import ASIDE, PERIOD, aside, map_rows
 from duio_mesh.mesh import Frame, Mesh, Source
+from duio_mesh.observers.watch import COLUMNS
 from duio_mesh.process import Report, main
 from duio_mesh.report.recording import Recording
 from duio_mesh.spec import RecorderSpec
@@ -73,11 +74,16 @@ def run(spec: RecorderSpec, report: Report) -> None:
         recording.fill(
             map_rows(spec.truth, spec.n), {i: map_rows(path, spec.sizes[i]) for i, path in spec.estimates.items()}
         )
+        for i, path in spec.estimates.items():
+            recording.rounds(i, map_rows(aside(path), COLUMNS))
     report("done", cpu_seconds=time.process_time(), rejected=mesh.rejections())
 
 
 def _keep(recording: Recording, spec: RecorderSpec, node: int | None, frame: Frame) -> int:
     """Hand one batch to the recording; the step after its last row."""
+    if node is not None and frame.r == ASIDE:
+        recording.rounds(node, frame.vector.reshape(-1, COLUMNS))
+        return frame.k
     rows = frame.vector.reshape(-1, spec.n if node is None else spec.sizes[node])
     if node is None:
         recording.truth(frame.k, rows)

@@ -3,7 +3,7 @@
 scenario.yaml  certificate.json  trace.npz  recording.rrd  metrics.json     written by the launcher (and recorder)
 nodes/node-3.spec  nodes/plant.spec  nodes/recorder.spec                    what each process was given (mode 0600)
 logs/node-3.jsonl  logs/node-3.err                                          events; whatever went to stderr
-rows/node-3.f64    rows/plant.f64                                           removed once trace.npz holds them
+rows/node-3.f64    rows/plant.f64    rows/node-3.f64.aside                  removed once trace.npz holds them
 keys/node-3/key.pem  ...                                                    removed at the end (mode 0600 until then)
 """
 
@@ -18,7 +18,8 @@ import numpy as np
 
 from duio_mesh.arrays import Array
 from duio_mesh.errors import RunError
-from duio_mesh.journal import map_rows
+from duio_mesh.journal import aside, map_rows
+from duio_mesh.observers.watch import COLUMNS
 from duio_mesh.simulation import Trace, estimate_sizes, split_trace
 from duio_mesh.synthesis.design import Design
 
@@ -74,7 +75,8 @@ class RunFolder:
         x = map_rows(self.rows("plant"), design.scenario.plant.n)
         rows = {i: map_rows(self.rows(f"node-{i}"), size) for i, size in sizes.items()}
         steps = max(map(len, rows.values()))
-        return split_trace(design, _padded(x, steps), {i: _padded(r, steps) for i, r in rows.items()})
+        watched = {i: np.array(map_rows(aside(self.rows(f"node-{i}")), COLUMNS)) for i in sizes}
+        return split_trace(design, _padded(x, steps), {i: _padded(r, steps) for i, r in rows.items()}, watched)
 
     def tidy(self) -> None:
         """Remove the journals (they are in trace.npz now) and empty files of standard error."""

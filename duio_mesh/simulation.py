@@ -13,6 +13,7 @@ from duio_mesh.faults import Reception, Stamp
 from duio_mesh.observers import make_observer
 from duio_mesh.observers.absence import Late, flagged, take_late
 from duio_mesh.observers.base import reader
+from duio_mesh.observers.watch import watcher
 from duio_mesh.spec import NodeSpec
 from duio_mesh.synthesis.design import Design
 from duio_mesh.trace import Trace as Trace  # re-exported: it lives lower, where report/ may import it
@@ -25,6 +26,7 @@ def simulate(design: Design, progress: Callable[[int], None] = lambda _: None) -
     network = {i: _InEdges(spec) for i, spec in design.nodes.items()}
     truth, rows, marks = [], {i: list[Array]() for i in observers}, {i: list[bool]() for i in observers}
     steps, batch = design.plant.steps, design.scenario.run.batch
+    watched = {i: (watcher(observer), list[Array]()) for i, observer in observers.items()}
     for k in range(0, steps, batch):
         done = min(k + batch, steps)
         for _ in range(k, done):
@@ -45,8 +47,15 @@ def simulate(design: Design, progress: Callable[[int], None] = lambda _: None) -
         for i, observer in observers.items():
             marks[i] += [flagged(observer)] * (done - k)
             rows[i] += [np.concatenate(estimate) for estimate in reader(observer)()]
+            look, seen = watched[i]
+            seen.append(look())
         progress(done)
-    trace = split_trace(design, np.array(truth), {i: np.array(r) for i, r in rows.items()})
+    trace = split_trace(
+        design,
+        np.array(truth),
+        {i: np.array(r) for i, r in rows.items()},
+        {i: np.concatenate(seen) for i, (_, seen) in watched.items()},
+    )
     return replace(trace, flagged=np.array([marks[int(i)] for i in trace.node_ids]))
 
 
@@ -68,8 +77,11 @@ class _InEdges:
         return {j: sent[j] for j in on_time}, arrived
 
 
-def split_trace(design: Design, x: Array, rows: dict[int, Array]) -> Trace:
-    """Cut every node's rows [x-hat | w-hat | v-hat] (K, size) into the named arrays of a trace."""
+def split_trace(design: Design, x: Array, rows: dict[int, Array], watched: Mapping[int, Array]) -> Trace:
+    """Cut every node's rows [x-hat | w-hat | v-hat] (K, size) into the named arrays of a trace.
+
+    ``watched``: every node's rows (m, 3) of the rounds of one step; m = 0 where none was watched.
+    """
     n, ids = design.scenario.plant.n, sorted(rows)
     q, r = reconstructs(design)
     xhat = np.stack([rows[i][:, :n] for i in ids])
@@ -80,6 +92,7 @@ def split_trace(design: Design, x: Array, rows: dict[int, Array]) -> Trace:
         xhat=xhat,
         what=np.stack([rows[i][:, n : n + q] for i in ids]) if q else None,
         vhat={i: rows[i][:, n + q :] for i in ids if r[i]},
+        rounds={i: rounds for i, rounds in watched.items() if len(rounds)},
     )
 
 

@@ -20,6 +20,8 @@ class Trace:
     xhat: Array  # (N, K, n), xhat[i, k] estimates x[k]
     what: Array | None = None  # (N, K, q) where the method reconstructs the unknown input
     vhat: dict[int, Array] = field(default_factory=dict)  # node id -> (K, r) where it reconstructs its noise
+    rounds: dict[int, Array] = field(default_factory=dict)
+    """Node id -> (m, 3) [round, residual, disagreement] of a watched step; for the recording, not in trace.npz."""
     flagged: NDArray[np.bool_] | None = None
     """(N, K) estimates that the node itself marks as not to be trusted; only the oracle keeps them so far."""
 

@@ -20,6 +20,7 @@ from duio_mesh.arrays import Array, contiguous
 from duio_mesh.errors import RunError
 from duio_mesh.observers.base import Estimate
 from duio_mesh.observers.fusion import FiniteTimeAverage, Fusion, fusion_rounds, make_fusion
+from duio_mesh.observers.watch import RoundWatch
 from duio_mesh.spec import NodeSpec
 
 OnRound = Callable[[int, float, float], None]
@@ -41,7 +42,9 @@ class Observer:
         self._xhat = np.zeros(n)
         self.on_round: OnRound | None = None
         """Set it before a step to watch that step's rounds: |T_i x_i - xi_i| and the largest |x_i - x_j| heard."""
-        self._left, self._full = spec.steps, spec.batch
+        self._watch, self._watched = RoundWatch(fusion_rounds(self._options)), spec.options.get("watch_step")
+        self._steps = self._left = spec.steps
+        self._full = spec.batch
         self._block: list[Array] = []  # xi of the samples that the next rounds fuse
         self._fusions: dict[int, Fusion] = {}  # by width: the last block of a run may be shorter
         self._fusion: Fusion | None = None
@@ -108,9 +111,16 @@ class Observer:
         columns = self._fusion.state.reshape(self._xhat.size, -1)
         return [Estimate(contiguous(column)) for column in columns.T]
 
+    def watched(self) -> Array:
+        """Rows (m, 3) [round, residual, disagreement] of the watched step's block, once; (0, 3) at all other times."""
+        return self._watch.take()
+
     def _begin(self) -> None:
         """Start the fusion of the block's xi, side by side."""
         width = len(self._block)
+        if self._watched is not None:
+            after = self._steps - self._left
+            self.on_round = self._watch if after - width <= self._watched < after else None
         if width not in self._fusions:
             self._fusions[width] = make_fusion(self._T, self._Hinv, self._hears, self._options, width)
         self._fusion = self._fusions[width]

@@ -9,7 +9,7 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from duio_mesh.report.entities import DESCRIPTION, EVENTS, RATES, STATES, TRUTH, Entities, spread
+from duio_mesh.report.entities import DESCRIPTION, EVENTS, RATES, STATES, TRUTH, WATCHED, Entities, spread
 from duio_mesh.report.topology import positions
 
 VIEWS = 12  # states that are shown side by side
@@ -22,7 +22,8 @@ NODE, RING, EDGE = 0.16, 0.23, 0.035  # radii in the topology view, where neighb
 
 def blueprint(entities: Entities, *, rates: bool) -> rrb.Blueprint:
     """Tabs: overview, estimates, what else is reconstructed, the run. ``rates``: whether the recording has any."""
-    tabs = [_overview(entities), _estimates(entities), *_reconstruction(entities), _run(entities, rates)]
+    tabs = [_overview(entities), _estimates(entities), *_reconstruction(entities), *_rounds(entities)]
+    tabs.append(_run(entities, rates))
     return rrb.Blueprint(
         rrb.Tabs(*tabs, active_tab=0),
         rrb.BlueprintPanel(state="collapsed"),
@@ -40,7 +41,8 @@ def styles(entities: Entities, description: str) -> Iterator[tuple[str, Any]]:
     for _, path in entities.truth:
         yield path, _line("truth", TRUTH, 4.0)
     for i in entities.ids:
-        for path in (entities.error(i), entities.rate(f"node-{i}")):
+        watched = [entities.rounds(kind, i) for kind in WATCHED if entities.spec.watch_step is not None]
+        for path in (entities.error(i), entities.rate(f"node-{i}"), *watched):
             yield path, _line(f"node {i}", entities.colours[i], 1.5)
         for _, path in entities.estimates(i):
             name = path.rsplit("/", 1)[1] if path.startswith("/noise") else f"node {i}"
@@ -160,6 +162,24 @@ def _reconstruction(entities: Entities) -> list[rrb.Container]:
     return [rrb.Grid(*views, name="Reconstruction")] if views else []
 
 
+def _rounds(entities: Entities) -> list[rrb.Container]:
+    """The rounds of the step that is watched, if one is."""
+    if (k := entities.spec.watch_step) is None:
+        return []
+    names = {
+        "residual": f"Step {k}, round by round: log10 ‖Tᵢ xᵢ − ξᵢ‖, from its own equations",
+        "disagreement": f"Step {k}, round by round: log10 of the largest ‖xᵢ − xⱼ‖, from its neighbours",
+    }
+    few = len(entities.ids) <= LEGEND
+    begin, end = (rr.TimeRangeBoundary.absolute(seconds=at * entities.spec.step) for at in (k, k + 1))
+    axis = rrb.TimeAxis(view_range=rr.TimeRange(start=begin, end=end))  # the rounds are spread over their step
+    views = [
+        _plot(name, [entities.rounds(kind, i) for i in entities.ids], legend=few, axis=axis)
+        for kind, name in names.items()
+    ]
+    return [rrb.Vertical(*views, name="Rounds")]
+
+
 def _run(entities: Entities, rates: bool) -> rrb.Container:
     document = rrb.TextDocumentView(origin=DESCRIPTION, name="What was run")
     if not rates:
@@ -168,12 +188,12 @@ def _run(entities: Entities, rates: bool) -> rrb.Container:
     return rrb.Horizontal(plot, document, name="Run")
 
 
-def _plot(name: str, contents: list[str], *, legend: bool) -> rrb.View:
+def _plot(name: str, contents: list[str], *, legend: bool, axis: rrb.TimeAxis | None = None) -> rrb.View:
     return rrb.TimeSeriesView(
         origin="/",
         contents=contents,
         name=name,
-        axis_x=_whole_run(),
+        axis_x=axis or _whole_run(),
         plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.RightTop, visible=legend),
         interaction=rrb.PlotInteraction(tooltip_mode=rrb.components.TooltipMode.All),
     )

@@ -21,6 +21,9 @@ STATES = {"up": 0x3FB950FF, "unknown": 0x8B949EFF, "late": 0xD29922FF, "down": 0
 """How a process or an edge can be, the better before the worse, and its colour (RGBA): green, grey, amber, red."""
 TRUTH = 0x9AA0A6FF
 
+WATCHED = ("residual", "disagreement")
+"""What is recorded of the rounds of a watched step."""
+
 Column: TypeAlias = tuple[int, str]
 """(column of a row, entity path that it is recorded under)."""
 
@@ -78,6 +81,10 @@ class Entities:
     def edge(self, i: int, j: int) -> str:
         """The edge in the topology view; both directions of an undirected edge are one."""
         return f"/mesh/edges/{min(i, j)}_{max(i, j)}"
+
+    def rounds(self, kind: str, i: int) -> str:
+        """log10 of the residual or the disagreement, round by round of the watched step."""
+        return f"/rounds/{kind}/{self.name(i)}"
 
     @cached_property
     def edges(self) -> dict[tuple[int, int], bool]:

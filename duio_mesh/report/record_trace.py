@@ -37,11 +37,14 @@ def record_trace(path: Path, scenario: Scenario, trace: Trace, description: str 
         truth="",
         estimates={},
         unknown_inputs=q,
+        watch_step=getattr(scenario.options, "watch_step", None),
     )
     try:
         with Recording(spec, rates=False) as recording:
             _outline(recording, trace)
             recording.fill(trace.x, rows)
+            for i, figures in trace.rounds.items():
+                recording.rounds(i, figures)
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)

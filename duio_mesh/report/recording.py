@@ -15,8 +15,8 @@ from duio_mesh.arrays import Array
 from duio_mesh.report import blueprint as look
 from duio_mesh.report.buffer import ROWS, Buffer
 from duio_mesh.report.conditions import Conditions
-from duio_mesh.report.entities import EVENTS, Column, Entities
-from duio_mesh.report.pairing import Decimator, Errors, Pairing, Span, Spans, runs
+from duio_mesh.report.entities import EVENTS, WATCHED, Column, Entities
+from duio_mesh.report.pairing import Decimator, Errors, Pairing, Span, Spans, log_norms, runs
 from duio_mesh.report.streams import Batch, FileStream, LiveStream, Opening
 from duio_mesh.spec import RecorderSpec
 
@@ -43,7 +43,7 @@ class Recording:
         opening = Opening.of(spec.name, spec.step, layout, look.styles(entities, description))
         self._file = FileStream(Path(spec.recording), opening)
         self._live = LiveStream(opening) if spec.live else None
-        self._closed = False
+        self._closed, self._watched = False, set[int]()
 
         self._pairing = Pairing(spec.n, entities.ids, spec.steps)
         self._seen: dict[int | None, Spans] = {source: Spans() for source in (None, *entities.ids)}
@@ -85,6 +85,22 @@ class Recording:
         self._record(node, k, rows)
         for first, last in self._pairing.known[node].gaps(k, k + len(rows)):
             self._say(self._pairing.estimates(node, first, rows[first - k : last - k, : self._spec.n]))
+
+    def rounds(self, node: int, rows: Array) -> None:
+        """Rows (m, 3) [round, residual, disagreement] of the step ``spec.watch_step``; a node's first ones count.
+
+        Raises ValueError for another shape.
+        """
+        if rows.ndim != 2 or rows.shape[1] != 1 + len(WATCHED):
+            raise ValueError(f"node {node}: rounds of shape {rows.shape} instead of (m, {1 + len(WATCHED)})")
+        k = self._spec.watch_step
+        if k is None or node in self._watched or not len(rows):
+            return
+        self._watched.add(node)
+        steps, r = np.full(len(rows), k), rows[:, 0].astype(np.int64)
+        for at, kind in enumerate(WATCHED, start=1):
+            columns = rr.Scalars.columns(scalars=log_norms(rows[:, at : at + 1]))
+            self._send(self._entities.rounds(kind, node), steps, columns, r)
 
     def liveness(self, who: str | int, state: str, k: int) -> None:
         """How a process (plant, node-3 or the node's id) is from step k on: up, late or down.
@@ -220,8 +236,14 @@ class Recording:
     def _scalars(self, path: str, steps: NDArray[np.int64], values: Array) -> None:
         self._send(path, steps, rr.Scalars.columns(scalars=values))
 
-    def _send(self, path: str, steps: Sequence[int] | NDArray[np.int64], columns: Any) -> None:
-        batch = Batch(path, np.asarray(steps, dtype=np.int64), columns)
+    def _send(
+        self,
+        path: str,
+        steps: Sequence[int] | NDArray[np.int64],
+        columns: Any,
+        rounds: NDArray[np.int64] | None = None,
+    ) -> None:
+        batch = Batch(path, np.asarray(steps, dtype=np.int64), columns, rounds)
         self._file.send(batch)
         if self._live:
             self._live.send(batch)

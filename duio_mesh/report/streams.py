@@ -39,6 +39,7 @@ class Batch(NamedTuple):
     path: str
     steps: NDArray[np.int64]  # (m,)
     columns: Any  # Rerun's component columns with m rows
+    rounds: NDArray[np.int64] | None = None  # (m,) within one step, ascending: they are spread over its time
 
 
 @dataclass(frozen=True)
@@ -73,8 +74,12 @@ class Opening:
 
     def send(self, stream: rr.RecordingStream, batch: Batch) -> None:
         """Send one batch on both timelines."""
-        nanoseconds = np.rint(batch.steps * (self.step * 1e9)).astype("timedelta64[ns]")
+        rounds = batch.rounds
+        at = batch.steps if rounds is None else batch.steps + rounds / (rounds[-1] + 1)
+        nanoseconds = np.rint(at * (self.step * 1e9)).astype("timedelta64[ns]")
         times = [rr.TimeColumn("sim_time", duration=nanoseconds), rr.TimeColumn("step", sequence=batch.steps)]
+        if rounds is not None:
+            times.append(rr.TimeColumn("round", sequence=rounds))
         stream.send_columns(batch.path, indexes=times, columns=batch.columns, strict=True)
 
 

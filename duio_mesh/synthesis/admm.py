@@ -41,6 +41,10 @@ def design(scenario: Scenario, progress: Progress) -> Design:
     options: Options = scenario.options
     if scenario.plant.time != "discrete":
         raise DesignError("admm needs a discrete plant (time: discrete); its local estimates are difference equations")
+    if options.watch_step is not None and options.watch_step >= scenario.run.steps:
+        raise DesignError(
+            f"observer.watch_step: there is no step {options.watch_step} in a run of {scenario.run.steps} steps"
+        )
     progress("what each node can follow alone")
     nodes, stability = local_estimates(scenario, options), stable_radius(options.stable_radius)
     islands: dict[int, Island] = {}
@@ -95,6 +99,8 @@ def _spec(scenario: Scenario, i: int, local: Local, island: Island) -> NodeSpec:
     P, L = local.filter.P, local.filter.L
     matrices = {"Abar": local.filter.Abar, "PL": P @ L, "PB": local.PB, "T": local.T, "s0": local.s0}
     given: dict[str, Any] = {"fusion": options.fusion, "setup": options.setup}
+    if options.watch_step is not None:
+        given["watch_step"] = options.watch_step
     if options.needs_H and options.setup == "global":
         matrices["Hinv"] = island.inverse
     if options.fusion == "admm":

@@ -48,6 +48,9 @@ class Options(Strict):
     without: Literal["auto", "hold", "predict"] = "auto"
     """Under faults, in a step that misses messages: hold the newest, or predict from the step before; both flag it."""
 
+    watch_step: Annotated[int, Field(ge=0)] | None = None
+    """A step whose rounds are recorded one by one: every node's residual and disagreement; by default none is."""
+
     @model_validator(mode="after")
     def _no_idle_option(self) -> Options:
         for fusion, names in _USED.items():
