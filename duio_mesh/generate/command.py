@@ -38,6 +38,7 @@ def parser() -> argparse.ArgumentParser:
     )
     kinds = p.add_subparsers(dest="kind", required=True, metavar="KIND")
     _heat(kinds.add_parser("heat", help="rooms of a building with HVAC units; discrete"))
+    _swing(kinds.add_parser("swing", help="machines of an IEEE power grid; continuous, or sampled"))
     _platoon(kinds.add_parser("platoon", help="vehicles in a row, an observer in each; discrete"))
     return p
 
@@ -80,6 +81,16 @@ def _platoon(p: argparse.ArgumentParser) -> None:
     p.add_argument("--vehicles", type=_count, required=True, metavar="V", help="vehicles; each is a node")
     _common(p, METHODS, "path", "")
     p.set_defaults(make=lambda a: document(Platoon(a.vehicles, a.graph, a.method, a.seed)))
+
+
+def _swing(p: argparse.ArgumentParser) -> None:
+    from duio_mesh.generate.swing import MACHINES, METHODS, Swing, document
+
+    p.add_argument("--case", type=_count, choices=tuple(MACHINES), required=True, help="the IEEE case")
+    p.add_argument("--nodes", type=_count, metavar="N", help="observers, at most and by default one per machine")
+    p.add_argument("--loads", type=_count, default=1, metavar="Q", help="loads that nobody meters (default 1)")
+    _common(p, METHODS, "ring", "")
+    p.set_defaults(make=lambda a: document(Swing(a.case, a.nodes, a.loads, a.graph, a.method, a.seed)))
 
 
 def _count(word: str) -> int:

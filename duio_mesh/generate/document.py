@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import textwrap
 from collections.abc import Mapping, Sequence
@@ -57,9 +58,7 @@ def flow(value: Any) -> str:
     if isinstance(value, Mapping):
         return "{" + ", ".join(f"{key}: {flow(item)}" for key, item in value.items()) + "}"
     if isinstance(value, str):
-        if not PLAIN.fullmatch(value):
-            raise ValueError(f"a text that needs quotes: {value!r}")
-        return value
+        return value if PLAIN.fullmatch(value) else json.dumps(value)
     if isinstance(value, np.ndarray | Sequence):
         return "[" + ", ".join(flow(item) for item in value) + "]"
     return _number(value)
