@@ -22,11 +22,11 @@ class Buffer:
         self._count = 0
 
     def add(self, steps: NDArray[np.int64], rows: Array) -> None:
-        """Rows (m, number of paths), which the caller may change afterwards."""
+        """Rows (m, number of paths); the caller gives them away."""
         if not len(steps):
             return
-        self._steps.append(steps.copy())
-        self._rows.append(rows.copy())
+        self._steps.append(steps)
+        self._rows.append(rows)
         self._count += len(steps)
         if self._count >= ROWS:
             self.flush(everything=True)

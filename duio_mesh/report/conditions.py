@@ -27,7 +27,7 @@ class Conditions:
         """
         self._entities, self._send, self._event, self._reached = entities, send, event, reached
         self._alive: dict[str, str] = {}
-        self._leaving: dict[str, tuple[int, int]] = {}  # who -> (down from which step, how far it had come)
+        self._leaving: dict[str, tuple[int, int]] = {}  # who -> (down from which step, how far it was at the last look)
         self._told: dict[tuple[int, int], str] = {}  # arc -> what was last said of it
         self._drawn: dict[tuple[int, int], str] = {}  # edge -> how it is drawn
         for i in entities.ids:
@@ -38,14 +38,14 @@ class Conditions:
     def process(self, who: str, state: str, k: int) -> None:
         """``who`` (plant, node-3) is ``state`` from step k on; down is believed later, by ``settle``."""
         if state == "down":
-            self._leaving[who] = (k, self._reached(who))
+            self._leaving[who] = (k, -1)
             return
         if who in self._leaving:  # gone and back before anybody could tell
             self._gone(who)
         self._change(who, state, k)
 
     def settle(self, *, final: bool = False) -> None:
-        """Call down who has gone and from whom nothing has come since the last call; ``final``: all who have gone.
+        """Call down who has gone and has given nothing between two calls; ``final``: all who have gone.
 
         A process that gave its last step has done its work; its last rows may come after the news that it went.
         """

@@ -30,7 +30,7 @@ def _island(nx: Any, graph: Any) -> dict[int, Array]:
     if len(ids) == 1:
         return {ids[0]: np.zeros(2)}
     if len(ids) > 2 and all(degree == 2 for _, degree in graph.degree):
-        order = [ids[0], *(j for _, j in list(nx.dfs_edges(graph, ids[0], sort_neighbors=sorted)))]
+        order = [ids[0], *(j for _, j in list(nx.dfs_edges(graph, ids[0])))]
         angles = 2 * np.pi * np.arange(len(order)) / len(order)
         at = {i: np.array([np.sin(a), -np.cos(a)]) for i, a in zip(order, angles, strict=True)}
     else:
