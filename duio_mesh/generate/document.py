@@ -49,7 +49,23 @@ def _block(content: Mapping[Any, Any], path: Path, comments: Mapping[Path, str])
         elif isinstance(value, np.ndarray) and value.ndim == 2:
             lines += [f"{indent}{key}:", *(f"{indent}  - {flow(row)}" for row in value)]
         else:
-            lines.append(f"{indent}{key}: {flow(value)}")
+            lines += _line(f"{indent}{key}: ", value)
+    return lines
+
+
+def _line(start: str, value: Any) -> list[str]:
+    """A key and its value on one line, or a long list on several that end between two items."""
+    whole = start + flow(value)
+    if len(whole) <= WIDTH or not isinstance(value, list):
+        return [whole]
+    indent = " " * (len(start) - len(start.lstrip()) + 2)
+    lines = [start + "["]
+    for item in map(flow, value):
+        if lines[-1].endswith("[") or len(lines[-1]) + len(item) + 2 > WIDTH:
+            lines.append(f"{indent}{item},")
+        else:
+            lines[-1] += f" {item},"
+    lines[-1] = lines[-1].removesuffix(",") + "]"
     return lines
 
 
