@@ -34,6 +34,9 @@ def settings(wire: Wire) -> dict[str, Any]:
         "low_pass_filter": [
             {"id": "size", "flows": ["ingress"], "messages": ["put"], "key_exprs": ["**"], "size_limit": guard.limit}
         ],
+        # With one link per peer Zenoh adds a link that claims the id of a connected peer to that peer's transport,
+        # unchecked, when the first of the two was dialled. From two on, a second link has to prove the first one's key.
+        "transport/unicast/max_links": 2,
         # what is longer than this is not even put together from its fragments
         "transport/link/rx/max_message_size": guard.limit + OVERHEAD,
         **_LINKS[guard.mode](guard),
