@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -10,6 +11,9 @@ from pathlib import Path
 
 import psutil
 import pytest
+
+for _threads in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
+    os.environ.setdefault(_threads, "1")  # before numpy: many small products, and other processes want the cores
 
 ROOT = Path(__file__).parent.parent
 TOPOLOGIES = ROOT / "topologies"

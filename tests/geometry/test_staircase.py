@@ -55,6 +55,8 @@ def check_blocks(C: np.ndarray, A: np.ndarray, found: Decomposition) -> None:
 def test_finds_the_planted_subspaces(case: tuple) -> None:
     C, A, U, bad = case
     whole = observability_decomposition(C, A)
+    # one output and ten modes can be planted so faintly that no tolerance separates them from noise: the margins say so
+    assume(whole.rank.kept > 1e-6 and whole.rank.dropped < 1e-11)
     undetectable = detectability_decomposition(C, A, stable_radius())
     assert (whole.nu, undetectable.nu) == (U.shape[1], bad.shape[1])
     assert gap(whole.U, U) < 1e-7
