@@ -80,13 +80,24 @@ class Faults:
         """The faults of the edges into this node."""
         return Incoming(target, self.seed, {s: rules for (s, t), rules in sorted(self.links.items()) if t == target})
 
+    def spoilt_by(self, source: int) -> Mapping[int, tuple[Rule, ...]]:
+        """What a sender has to do itself on its out-edges: flip bits and send twice. All else the receiver decides."""
+        found = {}
+        for (s, t), rules in sorted(self.links.items()):
+            if s == source and any(rule.corrupt or rule.duplicate for rule in rules):
+                found[t] = tuple(Rule(r.number, r.during, corrupt=r.corrupt, duplicate=r.duplicate) for r in rules)
+        return found
+
 
 NO_FAULTS = Faults()
 UNDISTURBED = Incoming()
 
 
 class Fate(NamedTuple):
-    """What happens to one frame. One that is lost or corrupt does not arrive, whatever else is said of it."""
+    """What happens to one frame. One that is lost or corrupt does not arrive, whatever else is said of it.
+
+    One that is both is sent with its flipped bit, and refused.
+    """
 
     lost: bool = False
     corrupt: bool = False
@@ -209,6 +220,7 @@ class Arrivals(NamedTuple):
 
     on_time: tuple[int, ...]  # in-neighbours whose frame of this very step and round arrives, ascending
     held: tuple[int, ...]  # in-neighbours whose frame of this step and round arrives in a later exchange
+    lost: tuple[int, ...]  # in-neighbours whose frame is lost on the way; a corrupt one is in none of these
     late: tuple[Stamp, ...]  # older frames that arrive now, oldest first
 
 
@@ -230,11 +242,11 @@ class Reception:
 
         A frame that is late by s steps and d rounds arrives in the d-th exchange after that of step k + s, round r.
         """
-        on_time, held_back = [], []
+        on_time, held_back, lost = [], [], []
         for j, edge in self._edges.items():
             fate = FINE if edge is None else edge.fate(k, r)
             self.counts["lost"] += fate.lost
-            self.counts["corrupt"] += fate.corrupt and not fate.lost
+            self.counts["corrupt"] += fate.corrupt
             self.counts["duplicate"] += fate.arrives and fate.duplicate
             if fate.arrives and fate.late:
                 self._held.append(_Held(Stamp(j, k, r), k + fate.steps, fate.rounds))
@@ -242,6 +254,8 @@ class Reception:
                 self.counts["late"] += 1
             elif fate.arrives:
                 on_time.append(j)
+            elif not fate.corrupt:
+                lost.append(j)
         late: list[Stamp] = []
         for held in list(self._held):
             if held.tick is None and (k, r) >= (held.step, held.stamp.r):
@@ -250,7 +264,9 @@ class Reception:
                 self._held.remove(held)
                 late.append(held.stamp)
         self._tick += 1
-        return Arrivals(tuple(on_time), tuple(held_back), tuple(sorted(late, key=lambda s: (s.k, s.r, s.source))))
+        return Arrivals(
+            tuple(on_time), tuple(held_back), tuple(lost), tuple(sorted(late, key=lambda s: (s.k, s.r, s.source)))
+        )
 
 
 @dataclass

@@ -8,7 +8,8 @@ the estimate of x(k).
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from functools import partial
 from math import isfinite
 
 import numpy as np
@@ -17,10 +18,11 @@ from duio_mesh.arrays import Array
 from duio_mesh.errors import RunError
 from duio_mesh.journal import Journal
 from duio_mesh.mesh import Mesh
+from duio_mesh.mesh.faulty import LONG_WAY, Arrived, FaultyExchange
 from duio_mesh.mesh.lockstep import Exchange, Line, Lockstep
-from duio_mesh.observers import make_observer
+from duio_mesh.observers import Observer, make_observer
+from duio_mesh.observers.absence import Late, take_late
 from duio_mesh.observers.base import reader
-from duio_mesh.observers.watch import watcher
 from duio_mesh.observers.watch import watcher
 from duio_mesh.process import Report, main
 from duio_mesh.spec import NodeSpec
@@ -37,28 +39,35 @@ def _samples(lockstep: Lockstep, plant: Line, spec: NodeSpec) -> Iterator[Array]
         yield from lockstep.take(plant, k, 0, count * size).reshape(count, size)
 
 
+def _hand_over(observer: Observer, k: int, arrived: Sequence[Arrived]) -> None:
+    """Give the observer the older frames that arrive in step k."""
+    take_late(observer, [Late(stamp.source, k - stamp.k, stamp.r, vector) for stamp, vector in arrived])
+
+
 def run(spec: NodeSpec, report: Report) -> None:
     """Run one node for ``spec.steps`` steps. Raises RunError when a neighbour or the plant is lost or late."""
-    if spec.faults.rules:
-        raise RunError(f"node-{spec.id}: faults can be run with --in-process only so far")
     i, p, window = spec.id, spec.p, spec.window
     observer = make_observer(spec)
     with Mesh(spec.wire, f"node-{i}", report.warn) as mesh:
         keys = mesh.keys
         plant = Line(mesh, keys.plant(i), f"plant -> {i}", "plant", ("plant", i), window)
-        heard = {j: Line(mesh, keys.edge(j, i), f"edge {j} -> {i}", f"node-{j}", (j, i), window) for j in spec.hears}
+        room = LONG_WAY if spec.without else 0
+        heard = {
+            j: Line(mesh, keys.edge(j, i), f"edge {j} -> {i}", f"node-{j}", (j, i), window, room) for j in spec.hears
+        }
         told = mesh.speak([(keys.edge(i, j), f"edge {i} -> {j}", (i, j)) for j in spec.tells])
         credit = mesh.speak([(keys.credit(i), f"{i} -> plant", (i, "plant"))])
         trace = mesh.speak([(keys.trace(i), f"{i} -> recorder", None)], drop=True)
         lockstep = Lockstep(mesh, spec.deadline)
-        exchange = Exchange(lockstep, told, heard)
+        exchange: Exchange | FaultyExchange = Exchange(lockstep, told, heard)
+        if spec.without:  # faults are made on purpose
+            exchange = FaultyExchange(spec, lockstep, told, heard, partial(_hand_over, observer))
         mesh.watch(lockstep.noticed)
         mesh.meet()
         report("ready")
         row = sum(part.size for part in observer.estimate())
         zeros = np.zeros(spec.n)
         estimates, samples = reader(observer), _samples(lockstep, plant, spec)
-        watched = watcher(observer)
         watched = watcher(observer)
         rounds, promised, begin, cpu = 0, spec.credit, time.monotonic(), time.process_time()
         beat = begin + BEAT
@@ -75,8 +84,6 @@ def run(spec: NodeSpec, report: Report) -> None:
                         beat = now + BEAT
                         credit.send(k, 0, NO_VECTOR)
                         report.beat()
-                if len(figures := watched()):
-                    journal.aside(spec.options["watch_step"], figures)
                 if len(figures := watched()):
                     journal.aside(spec.options["watch_step"], figures)
                 for estimate in estimates():

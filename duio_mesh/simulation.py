@@ -71,7 +71,7 @@ class _InEdges:
         """The vectors of step k, round r that arrive in this very exchange, and older ones that arrive now."""
         if self._reception is None:
             return {j: sent[j] for j in self._hears}, []
-        on_time, held, late = self._reception.next(k, r)
+        on_time, held, _, late = self._reception.next(k, r)
         arrived = [Late(s.source, k - s.k, s.r, self._held.pop(s)) for s in late]
         self._held |= {Stamp(j, k, r): sent[j] for j in held}
         return {j: sent[j] for j in on_time}, arrived

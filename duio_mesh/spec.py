@@ -74,6 +74,7 @@ class NodeSpec:
     block: int  # steps whose samples the plant sends in one frame
     batch: int  # steps between two exchanges: 1, or as many as the observer fuses at once
     faults: Incoming = UNDISTURBED  # on purpose, of its own in-edges
+    spoils: Mapping[int, tuple[Rule, ...]] = dataclasses.field(default_factory=dict)  # of frames to out-neighbours
     without: str = ""  # what to do without a neighbour's message; "" where none can be missing
     output: str = ""  # file of this node's own estimates, float64 rows; "" keeps none
     wire: Wire = UNWIRED

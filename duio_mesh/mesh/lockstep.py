@@ -31,8 +31,8 @@ TICK = 0.1  # seconds between the watchdog's looks
 class Line(Source):
     """One incoming link of a node."""
 
-    def __init__(self, mesh: Mesh, key: str, name: str, who: str, ready: Ready, window: int) -> None:
-        """``window``: steps that the sender may be ahead of us.
+    def __init__(self, mesh: Mesh, key: str, name: str, who: str, ready: Ready, window: int, room: int = 0) -> None:
+        """``window``: steps that the sender may be ahead of us. ``room``: frames that may wait; 0: as below.
 
         A neighbour that hears us is never more than a round ahead, because its next round needs our present one. One
         that does not hear us (a directed edge) is held back only by its own neighbours and by the plant's window. The
@@ -41,10 +41,12 @@ class Line(Source):
         super().__init__(name, who, Decoder(mesh.keys.run, who))
         self.prefix = prefix(mesh.keys.run, who)
         self.waiting: dict[tuple[int, int], Array] = {}  # good frames that are not due yet
-        self.window = window
-        self._subscriber = mesh.subscribe(key, zenoh.handlers.FifoChannel(ROOM * window), ready)
+        self.excused: dict[tuple[int, int], bool] = {}  # faults on purpose: frames past due, to be kept or dropped
+        self.window, self.room = window, room or ROOM * window
+        self._subscriber = mesh.subscribe(key, zenoh.handlers.FifoChannel(self.room), ready)
         self._closed = False
         self.receive = self._subscriber.handler.recv
+        self.poll = self._subscriber.handler.try_recv
         mesh.sources.append(self)
 
     def close(self) -> None:
@@ -99,7 +101,7 @@ class Lockstep:
                     line.last = (k, r)
                     self._at = None
                     return vector
-            self._set_aside(line, data, k, r)
+            self.set_aside(line, data, k, r)
 
     def _held(self, line: Line, k: int, r: int, size: int) -> Array | None:
         """The frame of step k, round r, if it came before it was due and has the right size."""
@@ -109,16 +111,20 @@ class Lockstep:
             return None
         return vector
 
-    def _set_aside(self, line: Line, data: bytes, k: int, r: int) -> None:
+    def set_aside(self, line: Line, data: bytes, k: int, r: int) -> None:
         """A frame that is not simply the next one: keep it for later, or count it and drop it."""
         try:
             frame = line.decode(data)
         except Rejected as e:
             self._mesh.reject(line, e.cause)
             return
-        if frame[:2] < (k, r) or frame[:2] in line.waiting:
+        kept = line.excused.pop(frame[:2], None)
+        if kept is not None:
+            if kept:
+                line.waiting[frame[:2]] = frame.vector
+        elif frame[:2] < (k, r) or frame[:2] in line.waiting:
             self._mesh.reject(line, "seen before")
-        elif frame.k - k > line.window or len(line.waiting) >= ROOM * line.window:
+        elif frame.k - k > line.window or len(line.waiting) >= line.room:
             self._mesh.reject(line, "too far ahead")
         else:
             line.waiting[frame[:2]] = frame.vector

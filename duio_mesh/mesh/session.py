@@ -13,6 +13,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable
+from functools import partial
 from queue import Empty, SimpleQueue
 from types import TracebackType
 from typing import Any, Self, TypeAlias
@@ -63,6 +64,11 @@ def _at_once(callback: Callable[[Any], None]) -> Any:
     return zenoh.handlers.Callback(callback, indirect=False)
 
 
+def _matched(news: SimpleQueue[str], name: str, status: Any) -> None:
+    if status.matching:  # the status is an object: it is always true
+        news.put(name)
+
+
 class Source:
     """One incoming key: who sends on it, what it has sent, and what of it was refused."""
 
@@ -97,6 +103,14 @@ class Outlet:
         for publisher in self._publishers:
             publisher.put(frame)
         self.frames += len(self._publishers)
+
+    def send_each(self, k: int, r: int, vector: Array, spoil: Callable[[int, bytes], Iterable[bytes]]) -> None:
+        """As ``send``, but key number ``at`` carries what ``spoil(at, frame)`` makes of the frame."""
+        frame = self._encode(k, r, vector)
+        for at, publisher in enumerate(self._publishers):
+            for sent in spoil(at, frame):
+                publisher.put(sent)
+                self.frames += 1
 
 
 class Mesh:
@@ -198,8 +212,7 @@ class Mesh:
         matched: set[str] = set()
         news = SimpleQueue[str]()
         for name, publisher in meeting.items():
-            told = _at_once(lambda status, name=name: news.put(name) if status.matching else None)
-            self._kept.append(publisher.declare_matching_listener(told))
+            self._kept.append(publisher.declare_matching_listener(_at_once(partial(_matched, news, name))))
             if publisher.matching_status.matching:
                 news.put(name)
         end = time.monotonic() + timeout

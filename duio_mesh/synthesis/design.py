@@ -50,6 +50,7 @@ def node_spec(
         block=_quarter(run),
         batch=run.batch,
         faults=scenario.faults.into(i),
+        spoils=scenario.faults.spoilt_by(i),
         without=scenario.options.without if scenario.faults.links else "",
     )
 

@@ -1,0 +1,82 @@
+"""The mesh under faults equals the oracle under the same faults, bit for bit, and the faults really happen."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+import duio_mesh
+from tests.conftest import TOPOLOGIES
+
+pytestmark = [pytest.mark.mesh, pytest.mark.usefixtures("nothing_left")]
+
+EVERYTHING = {
+    "loss": 0.1,
+    "gilbert_elliott": {"worsen": 0.05, "mend": 0.3},
+    "delay": {"steps": [0, 2]},
+    "duplicate": 0.2,
+    "reorder": 0.1,
+    "corrupt": 0.05,
+}
+FAULTS: dict[str, dict[str, Any]] = {
+    "everything": {"links": [EVERYTHING]},
+    "loss": {"links": [{"loss": 0.3}]},
+    "delay": {"links": [{"delay": {"steps": 1}}]},
+    "rounds": {"links": [{"delay": {"rounds": [0, 3]}}]},
+    "silence": {"links": [{"loss": 1.0}]},
+}
+METHODS = ["ring", "augmented_example9", "augmented_directed", "admm_ring", "relaxed_ring", "geometric_ring"]
+
+
+def design_of(name: str, faults: dict[str, Any], **changes: Any) -> Any:
+    changes = {"run.steps": 40} | changes
+    return duio_mesh.synthesise(duio_mesh.load_scenario(TOPOLOGIES / f"{name}.yaml", **changes, faults=faults))
+
+
+def same(design: Any) -> duio_mesh.RunResult:
+    """Run it both ways; the mesh's result."""
+    expected = duio_mesh.simulate(design).arrays()
+    result = duio_mesh.run(design, "run", record=False)
+    found = result.trace.arrays()
+    assert found.keys() == expected.keys()
+    for array, values in expected.items():
+        assert found[array].tobytes() == values.tobytes(), array
+    return result
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_every_method_under_everything(name: str) -> None:
+    result = same(design_of(name, FAULTS["everything"]))
+    refused = result.metrics["rejected"]
+    assert "checksum" in str(refused)  # flipped bits are caught by the frame check
+    assert "seen before" in str(refused)  # and second copies dropped
+
+
+@pytest.mark.parametrize("fault", ["loss", "delay", "rounds", "silence"])
+def test_every_kind_alone(fault: str) -> None:
+    assert same(design_of("ring", FAULTS[fault])).metrics["rejected"] == {}
+
+
+def test_finite_time_predicts_the_same() -> None:
+    same(design_of("finite_time_ring", FAULTS["loss"], **{"observer.setup": "global"}))
+
+
+def test_a_cut_and_what_waits_behind_it() -> None:
+    """An island may be a whole window ahead when the edge heals, with many rounds a step."""
+    edges = [[1, 2], [1, 3]]
+    cut = {"cuts": [{"edges": edges, "during": [5, 35]}]}
+    same(design_of("admm_ring", cut, **{"run.window": 4}))
+
+
+def test_batches() -> None:
+    same(design_of("relaxed_ring", FAULTS["everything"], **{"run.batch": 4}))
+
+
+def test_the_faults_have_a_seed_of_their_own() -> None:
+    one, same_again, other = (
+        duio_mesh.run(design_of("ring", FAULTS["loss"] | {"seed": s}), f"run-{n}", record=False)
+        for n, s in enumerate((1, 1, 2))
+    )
+    assert one.metrics["estimates_sha256"] == same_again.metrics["estimates_sha256"]
+    assert one.metrics["estimates_sha256"] != other.metrics["estimates_sha256"]
