@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import os
 import re
 import shlex
 import sys
@@ -138,16 +137,17 @@ def _order(argv: Sequence[str]) -> str:
 
 def _write(path: Path, written: str) -> None:
     """A new file, with the schema's place in its first line when the schema stands beside it or one folder up."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as e:
+        raise ScenarioError([f"--out {path}: cannot be written: {e.strerror}"]) from None
     for schema in ("schema.json", "../schema.json"):
         if (path.parent / schema).is_file():
             written = f"# yaml-language-server: $schema={schema}\n{written}"
             break
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
         with path.open("x", encoding="utf-8") as file:
             file.write(written)
-            file.flush()
-            os.fsync(file.fileno())
     except FileExistsError:
         raise ScenarioError([f"--out {path}: already exists; a file is never overwritten"]) from None
     except OSError as e:

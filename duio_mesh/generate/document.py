@@ -17,7 +17,7 @@ Path = tuple[str | int, ...]
 WIDTH = 120
 BLOCKS = ("plant", "observer", "nodes", "graph", "run")
 """Mappings that stand on lines of their own, and so do the nodes; all others are written {like: this}."""
-PLAIN = re.compile(r"[A-Za-z][A-Za-z0-9_ ./()+-]*[A-Za-z0-9_)]|[A-Za-z]")
+PLAIN = re.compile(r"(?i)(?!(?:true|false|null)$)(?:[A-Za-z][A-Za-z0-9_ ./()+-]*[A-Za-z0-9_)]|[A-Za-z])")
 
 
 class Document(NamedTuple):
@@ -74,7 +74,7 @@ def flow(value: Any) -> str:
     if isinstance(value, Mapping):
         return "{" + ", ".join(f"{key}: {flow(item)}" for key, item in value.items()) + "}"
     if isinstance(value, str):
-        return value if PLAIN.fullmatch(value) else json.dumps(value)
+        return value if PLAIN.fullmatch(value) else json.dumps(value, ensure_ascii=False)
     if isinstance(value, np.ndarray | Sequence):
         return "[" + ", ".join(flow(item) for item in value) + "]"
     return _number(value)

@@ -158,9 +158,9 @@ def _seen(grid: Grid, E: Array, i: int, N: int) -> list[int]:
     """The machines, counted from 0, that node i measures: i, i + N, ..., in all as many as there are loads.
 
     With fewer it could not tell the loads apart; with more it would see a little of the other machines by itself, too
-    little for a gain of sensible size (norms of 1e3 to 1e7 on case 39). A load reaches a machine's speed first, so these
-    rows of E must have full column rank (Assumption 2): each machine more is the one that raises the least singular
-    value of the rows, taken with length 1, most.
+    little for a gain of sensible size (norms of 1e3 to 1e7 on case 39). A load reaches a machine's speed first, so
+    these rows of E must have full column rank (Assumption 2): each machine more is the one that raises the least
+    singular value of the rows, taken with length 1, most.
     """
     g = len(grid.machines)
     felt = E[g:] / np.linalg.norm(E[g:], axis=1, keepdims=True)
