@@ -63,9 +63,7 @@ def _passwords(folders: Mapping[str, Path], dials: Mapping[str, tuple[str, ...]]
     for who, folder in folders.items():
         _write(folder / PASSWORD, own[who].encode())
         callers = [other for other, dialled in dials.items() if who in dialled]
-        # Zenoh takes an empty list for "nobody needs a password": there is always somebody on it, if only nobody
-        lines = [f"{other}:{own[other]}" for other in callers] or [f"nobody:{secrets.token_hex(BYTES)}"]
-        _write(folder / USERS, "".join(line + "\n" for line in lines).encode())
+        _write(folder / USERS, "".join(f"{other}:{own[other]}\n" for other in callers).encode())  # empty: nobody may
 
 
 @dataclass(frozen=True)

@@ -74,8 +74,7 @@ def test_a_process_knows_the_passwords_of_those_that_call_it_only(tmp_path: Path
     for who, folder in folders.items():
         lines = dict(line.split(":") for line in (folder / USERS).read_text().splitlines())
         callers = {other for other, dialled in DIALS.items() if who in dialled}
-        assert {name: word for name, word in lines.items() if name in own} == {other: own[other] for other in callers}
-        assert lines, "Zenoh would let everybody in"
+        assert lines == {other: own[other] for other in callers}
 
 
 def test_no_other_mode(tmp_path: Path) -> None:

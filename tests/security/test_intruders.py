@@ -108,9 +108,13 @@ def test_nothing_that_intruders_say_moves_an_estimate(mode: str, monkeypatch: py
         assert stranger(endpoint, own | {"id": name}) is None
         for other in ("node-1", "plant"):  # which the victim has dialled itself
             assert stranger(endpoint, own | {"id": security.identity(wire.run, other)}) is None
-        thief = stranger(endpoint, own)
+        thief = stranger(endpoint, own | {"connect/timeout_ms": 10_000})
         assert thief is not None
         shout(thief, siege)
+        host, port = endpoint.split("/")[1].split(":")
+        for _ in range(50):  # not even Zenoh's or TLS' language
+            with socket.create_connection((host, int(port))) as raw:
+                raw.sendall(draw.randbytes(2000))
         # as node 3 itself: what is not its own to say ...
         for k in LIES:
             siege.put(siege.keys.edge(1, 2), siege.forged("node-1", k))
@@ -212,3 +216,16 @@ def test_a_member_cannot_slip_into_the_link_of_another(first: str, tmp_path: Pat
         session.close()
     for held in ports.values():
         held.close()
+
+
+def test_who_has_no_callers_lets_nobody_in(tmp_path: Path) -> None:
+    """An empty list of passwords is not an open door."""
+    folders = credentials.issue(tmp_path / "keys", "password", "r", {"node-9": ()}, "127.0.0.1")
+    with socket.socket() as held:
+        held.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        held.bind(("127.0.0.1", 0))
+        endpoint = f"tcp/127.0.0.1:{held.getsockname()[1]}"
+        guard = Guard("password", "node-9", str(folders["node-9"]), (), (), (), 10**6)
+        with Mesh(Wire("r", (endpoint,), (), guard), "node-9"):
+            assert stranger(endpoint, {}) is None
+            assert stranger(endpoint, {"transport/auth/usrpwd": {"user": "nobody", "password": "x"}}) is None
