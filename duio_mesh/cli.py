@@ -53,6 +53,12 @@ def parser() -> argparse.ArgumentParser:
     how.add_argument("--in-process", action="store_true", help="the oracle: one process, no Zenoh, the same bits")
     how.add_argument("--check", action="store_true", help="validate, check the theory, design, start nothing")
     how.add_argument("--dry-run", action="store_true", help="print what would be started")
+    p.add_argument(
+        "--contingency",
+        type=int,
+        metavar="K",
+        help="with --check: what is left when up to K edges or nodes are lost (docs/contingency.md)",
+    )
     p.add_argument("--live", action="store_true", help="also serve the recording to a Rerun viewer on this host")
     p.add_argument("--plot", action="store_true", help="write PNG figures of the errors and states into the results")
     p.add_argument("--no-record", action="store_true", help="no recorder process, no recording.rrd")
@@ -76,6 +82,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
         return command.main(argv[1:])
     args = parser().parse_args(argv)
+    if args.contingency is not None and not args.check:
+        parser().error("--contingency says what a design is worth on other graphs: use it with --check")
     for number in (signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, _interrupt)
     try:
@@ -106,11 +114,14 @@ def _main(args: argparse.Namespace) -> int:
         raise ScenarioError([f"--out {args.out}: already exists and is not empty; a run is never overwritten"])
 
     from duio_mesh import console
+    from duio_mesh.synthesis.contingency import with_contingency
 
     processes = not (args.in_process or args.check or args.dry_run)
     with _nursery(recorder=not args.no_record) if processes else contextlib.nullcontext() as supervisor:
         with console.working("designing the observers") as say:
             design = synthesis.synthesise(scenario, say)
+            if args.contingency is not None:
+                design = with_contingency(design, args.contingency, say)
         if args.check:
             console.certificate(design)
             return CONVERGED

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 from rich.table import Table
 
@@ -106,8 +107,25 @@ def certificate(design: Design) -> None:
     _out.print(conditions)
     _out.print(_by_node(found["nodes"]))
     for name, value in found.items():
-        if name not in ("conditions", "nodes"):
+        if name not in ("conditions", "nodes", "contingency"):
             _out.print(f"{name:24} {_text(value)}")
+    if "contingency" in found:
+        _contingency(found["contingency"])
+
+
+def _contingency(found: Mapping[str, Any]) -> None:
+    """What is left after each loss, and the worst."""
+    table = Table("lost", "radius", "the rest", title=f"contingencies: spectral radius of {found['radius_of']}")
+    for case in ({"lost": "nothing", "radius": found["nominal"], "failing": found["nominal_failing"]}, *found["cases"]):
+        words = "[green]reconstructs[/]"
+        if case["failing"]:
+            islands = " and ".join(_text(ids) for ids in case["failing"])
+            words = f"[red]does not:[/] nodes {escape(islands)}"
+        table.add_row(case["lost"], _text(case["radius"]), words)
+    _out.print(table)
+    lost = sum(bool(case["failing"]) for case in found["cases"])
+    _out.print(f"{'worst':24} {found['worst'] or '-'}")
+    _out.print(f"{'survives':24} {len(found['cases']) - lost} of {len(found['cases'])}")
 
 
 def _by_node(nodes: Mapping[Any, Mapping[str, Any]]) -> Table:

@@ -14,6 +14,7 @@ from duio_mesh.errors import DesignError
 from duio_mesh.geometry import stable_radius
 from duio_mesh.scenario.model import Scenario
 from duio_mesh.spec import NodeSpec
+from duio_mesh.synthesis.admm_contingency import RADIUS_OF, error_radius
 from duio_mesh.synthesis.admm_local import LEAST_CURVATURE, Local, check_joint, facts, local_estimates, noise_gain
 from duio_mesh.synthesis.admm_options import Options
 from duio_mesh.synthesis.admm_rates import (
@@ -27,7 +28,7 @@ from duio_mesh.synthesis.admm_rates import (
 )
 from duio_mesh.synthesis.design import Design, Progress, node_spec, plant_spec
 
-__all__ = ["Options", "design"]
+__all__ = ["RADIUS_OF", "Options", "design", "error_radius"]
 
 _ROUNDING = 1e-6  # finite_time must be exact to this, or the graph has too many different eigenvalues
 
@@ -109,15 +110,15 @@ def _spec(scenario: Scenario, i: int, local: Local, island: Island) -> NodeSpec:
         given |= {"c": options.c, "rounds": options.rounds}
     if options.fusion == "finite_time" or options.setup == "distributed":
         given |= {"island_size": len(island.ids), "eigenvalues": spectrum(island.L)}
+    predicts = options.without == "predict" or (options.without == "auto" and options.fusion == "finite_time")
+    if scenario.faults.links and predicts:
+        matrices |= {"A": scenario.plant.A, "B": scenario.known(i)}
     return node_spec(scenario, i, matrices, given)
 
 
 def _certificate(
     options: Options, nodes: Mapping[int, Local], islands: Mapping[int, Island], described: list[dict[str, Any]]
 ) -> dict[str, Any]:
-    predicts = options.without == "predict" or (options.without == "auto" and options.fusion == "finite_time")
-    if scenario.faults.links and predicts:
-        matrices |= {"A": scenario.plant.A, "B": scenario.known(i)}
     """``spectral_radius`` is that of the error from step to step, which lives in the local estimates alone.
 
     The fusion starts afresh in every step and remembers nothing: after exact fusion the error of every node is

@@ -131,24 +131,32 @@ def fused_maps(island: Island, options: Options) -> Array:
 
 def fusion_radius(island: Island, options: Options) -> float:
     """Spectral radius of the fusion's error from round to round; 0 for finite_time, which is exact after its rounds."""
-    n, N = len(island.H), len(island.T)
     if options.fusion == "finite_time":
         return 0.0
     if options.fusion == "relaxed":
-        adjacency = np.diag(island.degrees) - island.L
-        F = options.c * np.einsum("iab,ij->iajb", _relaxed_solve(island, options.c), adjacency).reshape(N * n, N * n)
-        return float(np.abs(np.linalg.eigvals(F)).max())
-    return float(np.abs(np.linalg.eigvals(admm_matrix(island, options))).max())
+        return float(np.abs(np.linalg.eigvals(relaxed_matrix(island, options.c, island.degrees))).max())
+    return float(np.abs(np.linalg.eigvals(admm_matrix(island, options, island.step_sizes(options)))).max())
 
 
-def admm_matrix(island: Island, options: Options) -> Array:
-    """The error recursion of (15) in (x, q), psi = (Q kron I) q with Q the complement of (1, ..., 1).
+def relaxed_matrix(island: Island, c: float, degrees: Array) -> Array:
+    """(N n, N n): the relaxed fusion's error recursion when the nodes take their degrees for ``degrees`` (N,).
+
+    What a node misses of its degree it takes to agree with itself.
+    """
+    n, N = len(island.H), len(island.T)
+    own = island.curvatures(normalised=True) + c * degrees[:, None, None] * np.eye(n)
+    weights = np.diag(degrees) - island.L
+    return np.asarray(c * np.einsum("iab,ij->iajb", np.linalg.inv(own), weights)).reshape(N * n, N * n)
+
+
+def admm_matrix(island: Island, options: Options, steps: Array) -> Array:
+    """The error recursion of (15) with step sizes (N,) in (x, q), psi = (Q kron I) q, Q the complement of (1, ..., 1).
 
     The sum of all psi_i is zero for ever; leaving it out removes n eigenvalues 1 that mean nothing.
     """
     N, n = len(island.T), len(island.H)
     Q, unit = complement(np.ones((N, 1)) / np.sqrt(N)), np.eye(n)
-    alpha = np.repeat(island.step_sizes(options), n)[:, None]
+    alpha = np.repeat(steps, n)[:, None]
     M = np.zeros((N * n, N * n))
     for i, block in enumerate(island.curvatures(options.normalised)):
         M[i * n : (i + 1) * n, i * n : (i + 1) * n] = block

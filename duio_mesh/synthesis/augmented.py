@@ -14,7 +14,7 @@ import numpy as np
 from duio_mesh.arrays import Array
 from duio_mesh.errors import DesignError
 from duio_mesh.geometry import RTOL, Stability, detectability_decomposition, stable_radius
-from duio_mesh.scenario.model import Scenario
+from duio_mesh.scenario.model import Graph, Scenario
 from duio_mesh.spec import NodeSpec
 from duio_mesh.synthesis.augmented_error import (
     ErrorSystem,
@@ -23,6 +23,7 @@ from duio_mesh.synthesis.augmented_error import (
     Sensor,
     Transient,
     distance_to_instability,
+    error_blocks,
     spectral_radius,
     transient,
 )
@@ -31,9 +32,12 @@ from duio_mesh.synthesis.augmented_gains import find_gains, given_H
 from duio_mesh.synthesis.augmented_options import BraschPearson, Options
 from duio_mesh.synthesis.design import Design, Progress, node_spec, plant_spec
 from duio_mesh.synthesis.noise import noise_covariance
+from duio_mesh.synthesis.sampled import error_system
 from duio_mesh.synthesis.uio import decouple_node
 
-__all__ = ["Options", "design"]
+__all__ = ["RADIUS_OF", "Options", "design", "error_radius"]
+
+RADIUS_OF = "error matrix (12), per step"
 
 
 class Figures(NamedTuple):
@@ -77,6 +81,13 @@ def design(scenario: Scenario, progress: Progress) -> Design:
         for i, sensor, own in zip(scenario.nodes, network.sensors, gains, strict=True)
     }
     return Design(scenario, plant_spec(scenario), specs, certificate)
+
+
+def error_radius(design: Design, graph: Graph) -> float:
+    """Spectral radius of Phi (12) of graph.ids with the designed gains on another graph."""
+    delay = design.scenario.options.delay
+    blocks = [error_blocks(design.nodes[i].matrices, delay) for i in graph.ids]
+    return spectral_radius(error_system(blocks, graph.laplacian()))
 
 
 def _network(scenario: Scenario, options: Options) -> tuple[Network, dict[int, View], dict[int, float]]:

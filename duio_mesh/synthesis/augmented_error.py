@@ -14,7 +14,7 @@ With delay 1 every message is one step old and s_i is formed from e(t-1) of both
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from duio_mesh.arrays import Array
+from duio_mesh.synthesis.sampled import Coupled
 
 
 class Sensor(NamedTuple):
@@ -215,3 +216,20 @@ def distance_to_instability(Phi: Array) -> float:
         minimize_scalar(least, bounds=(outer[k], outer[k + 2]), method="bounded").fun for k in np.argsort(found)[:3]
     ]
     return float(min(found.min(), *refined))
+
+
+def error_blocks(matrices: Mapping[str, Array], delay: int) -> Coupled:
+    """One node's part of Phi (12) from what the node is given: N, K, Q, R, S of (6).
+
+    State [e; xi], with delay 1 [e(t); e(t-1); xi], and s_i formed from the older error.
+    """
+    N, K, Q, R, S = (matrices[name] for name in "NKQRS")
+    n, beta = Q.shape
+    old = n if delay else 0
+    F = linalg.block_diag(N, np.zeros((old, old)), S)
+    F[:n, n + old :] = Q
+    F[n : n + old, :n] = np.eye(old, n)
+    pull = np.vstack([-K, np.zeros((old, n)), -R])  # Coupled subtracts
+    X = np.zeros((n, n + old + beta))
+    X[:, old : old + n] = np.eye(n)
+    return Coupled(F, np.eye(len(F)), pull, X)

@@ -98,7 +98,7 @@ def minimise_largest_eigenvalue(pencils: Sequence[Pencil], say: Say = lambda _: 
         point = _centre(problem, point, weight, say)
     x = problem.full(point.unknowns)
     value = max(pencil.value(x) for pencil in problem.pencils)
-    lower = _lower_bound(problem, point, weight)
+    lower = _lower_bound(problem, point, weight, value)
     if not value - lower <= 100 * GAP * scale:
         raise DesignError(
             f"the eigenvalue problem behind (38) was not solved: the best value found is {value:.6g}, but only "
@@ -116,36 +116,43 @@ def _centre(problem: _Problem, point: _Point, weight: float, say: Say) -> _Point
         decrement = float(-gradient @ step)
         if decrement < 1e-5:  # the value is then within (size + 0.01) / weight of the least one
             break
-        length = 1.0
-        while length > 1e-9:
+        # with exact derivatives a self-concordant function accepts about 1 / (1 + sqrt(decrement)); where much less
+        # is accepted rounding decides, and the certificate tells whether the point is good enough
+        length, least = 1.0, 0.1 / (1 + np.sqrt(decrement))
+        while length > least:
             trial = problem.at(point.unknowns + length * step)
             if weight * length * step[-1] - trial.log_det + point.log_det <= -0.25 * length * decrement:
                 break
             length /= 2
         else:
-            break  # rounding decides from here on; the certificate tells whether the point is good enough
+            break
         point = trial
     return point
 
 
-def _newton(gradient: Array, hessian: Array) -> Array:
+def _newton(gradient: Array, hessian: Array, rcond: float = 1e-14) -> Array:
     unit = 1 / np.sqrt(np.diag(hessian))  # x_i and gamma have different units
     # near the boundary one eigenvector of S decides everything and the Hessian is nearly of rank one
-    return -unit * np.linalg.lstsq(hessian * np.outer(unit, unit), unit * gradient, rcond=1e-14)[0]
+    return -unit * np.linalg.lstsq(hessian * np.outer(unit, unit), unit * gradient, rcond=rcond)[0]
 
 
-def _lower_bound(problem: _Problem, point: _Point, weight: float) -> float:
-    """<F(x'), Z> / tr Z <= the value at any x', for the Z that the Newton step (dx, dgamma) = d gives.
+def _lower_bound(problem: _Problem, point: _Point, weight: float, value: float) -> float:
+    """<F(x'), Z> / tr Z <= the value at any x', for the Z that a Newton step (dx, dgamma) = d gives.
 
     Z = G - G dS G with G = S^-1 is positive when |G^1/2 dS G^1/2|_F^2 = d'H d < 1. With r = gradient + H d its inner
-    products are <F_i, Z> = r_i (zero up to rounding), tr Z = weight - r_gamma and <S, Z> = size - tr(G dS), so that
-    neither G nor Z is needed. What rounding leaves of r is counted against the bound.
+    products are <F_i, Z> = r_i, tr Z = weight - r_gamma and <S, Z> = size - tr(G dS), so that neither G nor Z is
+    needed. r is zero up to rounding, and up to flat directions that a step of lower rank leaves out; it counts against
+    the bound over the box that holds every x' as good as ``value``.
     """
     gradient, hessian = problem.derivatives(point, weight)
-    step = _newton(gradient, hessian)
-    if not step @ hessian @ step < 0.99:
-        return -np.inf
-    r = gradient + hessian @ step
-    along = (weight - gradient[-1]) * step[-1] - gradient[:-1] @ step[:-1]  # tr(G dS)
-    x, gamma, trace = point.unknowns[:-1], point.unknowns[-1], weight - r[-1]
-    return float(gamma - (problem.size - along + np.abs(r[:-1]) @ np.abs(x)) / trace)
+    x, gamma = point.unknowns[:-1], point.unknowns[-1]
+    box = np.min([pencil.reach(value) for pencil in problem.pencils], axis=0)[problem.free]
+    best = -np.inf
+    for rcond in (1e-14, 1e-12, 1e-10, 1e-8):
+        step = _newton(gradient, hessian, rcond)
+        r = gradient + hessian @ step
+        trace = weight - r[-1]
+        if step @ hessian @ step < 0.99 and trace > 0:
+            along = (weight - gradient[-1]) * step[-1] - gradient[:-1] @ step[:-1]  # tr(G dS)
+            best = max(best, float(gamma - (problem.size - along + np.abs(r[:-1]) @ (np.abs(x) + box)) / trace))
+    return best

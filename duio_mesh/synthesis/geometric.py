@@ -17,11 +17,12 @@ from scipy import linalg
 from duio_mesh.arrays import Array
 from duio_mesh.errors import DesignError
 from duio_mesh.geometry.subspace import intersection, norm
-from duio_mesh.scenario.model import OpenLoop, Scenario, Signal
+from duio_mesh.scenario.model import Graph, OpenLoop, Scenario, Signal
 from duio_mesh.spec import NodeSpec
 from duio_mesh.synthesis.design import Design, Progress, node_spec, plant_spec
 from duio_mesh.synthesis.geometric_local import LocalUio, local_uio
 from duio_mesh.synthesis.sampled import (
+    Coupled,
     HoldOptions,
     Step,
     abscissa,
@@ -32,6 +33,8 @@ from duio_mesh.synthesis.sampled import (
     radius,
     sampled,
 )
+
+RADIUS_OF = "sampled error system, per tick; the larger of two: sign term saturated, and around zero"
 
 
 class Options(HoldOptions):
@@ -104,6 +107,19 @@ def design(scenario: Scenario, progress: Progress) -> Design:
     }
     specs = {i: _spec(scenario, i, node, steps[i], chi) for i, node in nodes.items()}
     return Design(scenario, plant_spec(scenario), specs, certificate)
+
+
+def error_radius(design: Design, graph: Graph) -> float:
+    """Spectral radius of the sampled errors of graph.ids with the designed gains on another graph."""
+    radii = []
+    for near in (True, False):
+        blocks = []
+        for i in graph.ids:
+            M, given = design.nodes[i].matrices, design.nodes[i].options
+            slope = given["gamma"] / given["width"] if near and given["width"] else 0.0
+            blocks.append(Coupled(M["Phi"], M["K"], (given["chi"] + slope) * M["R"], M["X"]))
+        radii.append(radius(error_system(blocks, graph.laplacian())))
+    return max(radii)
 
 
 def _width(scenario: Scenario, options: Options, i: int, h: float) -> float:

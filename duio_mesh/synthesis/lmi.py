@@ -5,7 +5,6 @@ Every gain is designed here from the whole scenario; what a node gets is its own
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Annotated, Literal
 
 import numpy as np
@@ -19,18 +18,20 @@ from duio_mesh.geometry import (
     observability_decomposition,
     stable_radius,
 )
-from duio_mesh.scenario.model import Scenario
+from duio_mesh.scenario.model import Graph, Scenario
 from duio_mesh.scenario.strict import Strict
 from duio_mesh.spec import NodeSpec
 from duio_mesh.synthesis.absence import Absence
-from duio_mesh.synthesis.consensus import Coupling, Undetectable, couple
 from duio_mesh.synthesis.design import Design, Progress, node_spec, plant_spec
-from duio_mesh.synthesis.lmi_network import Local, Network, certificate
+from duio_mesh.synthesis.lmi_coupling import couple_islands
+from duio_mesh.synthesis.lmi_network import Local, Network, certificate, error_matrix_of
 from duio_mesh.synthesis.local_gain import Subsystem, h2_gain, hinf_gain, placed_gain, radius, worst_gain
 from duio_mesh.synthesis.noise import noise_covariance
 from duio_mesh.synthesis.uio import decouple_node
 
-__all__ = ["Options", "design"]
+__all__ = ["RADIUS_OF", "Options", "design", "error_radius"]
+
+RADIUS_OF = "error matrix (31), per step"
 
 Pole = Annotated[float, Field(gt=-1, lt=1)]
 
@@ -54,8 +55,9 @@ class Options(Absence):
     """What the neighbours must supply: unobservable modes that are not stable, or all unobservable modes."""
     local_gain: Literal["hinf", "h2"] | Poles = "hinf"
     """K_id: (34), or the least stationary error variance under the file's noise, or given poles."""
-    consensus: Literal["paper", "norm"] = "norm"
-    """g: (38)-(39) as printed, or the least ||Phi_u||_2, which is (49)."""
+    consensus: Literal["paper", "norm", "robust", "schur"] = "norm"
+    """g: (38)-(39) as printed; the least ||Phi_u||_2, which is (49); the least that holds with any one edge lost too;
+    or any that stabilise, by the spectral radius itself."""
 
 
 def design(scenario: Scenario, progress: Progress) -> Design:
@@ -66,14 +68,20 @@ def design(scenario: Scenario, progress: Progress) -> Design:
     """
     if scenario.plant.time != "discrete":
         raise DesignError("lmi needs a discrete plant (time: discrete); its observers are difference equations")
-    progress("decoupling, decomposition and local gain of every node")
-    nodes = {i: _local(scenario, i) for i in scenario.nodes}
-    progress("coupling gains")
-    network = _couple(scenario, nodes)
+    nodes = {}
+    for i in scenario.nodes:
+        progress(f"decoupling, decomposition and local gain of node {i}")
+        nodes[i] = _local(scenario, i)
+    network = couple_islands(scenario, nodes, progress)
     progress("certificate")
-    promises = certificate(scenario, network)
     specs = {i: _spec(scenario, i, network) for i in nodes}
+    promises = certificate(scenario, network, error_matrix_of(specs, scenario.graph), specs)
     return Design(scenario, plant_spec(scenario), specs, promises)
+
+
+def error_radius(design: Design, graph: Graph) -> float:
+    """Spectral radius of (31) of graph.ids with the designed gains on another graph."""
+    return radius(error_matrix_of(design.nodes, graph))
 
 
 def _local(scenario: Scenario, i: int) -> Local:
@@ -112,37 +120,6 @@ def _local(scenario: Scenario, i: int) -> Local:
         beta = worst_gain(system, Kd)
     # (19) prints K_i = D_i' K_id; the dimensions and (20) need D_i
     return Local(C, A, uio, parts, D @ Kd, beta, radius(system.A - Kd @ system.C), inert)
-
-
-def _couple(scenario: Scenario, nodes: Mapping[int, Local]) -> Network:
-    """g, island by island: (38) is the maximum over islands, so each may take its own best without raising it."""
-    options: Options = scenario.options
-    ids, laplacian = list(nodes), scenario.graph.laplacian()
-    g: dict[int, float] = {}
-    islands: dict[tuple[int, ...], Coupling] = {}
-    for island in scenario.graph.islands():
-        rows = [ids.index(i) for i in island]
-        parts = [Undetectable(nodes[i].parts.U.T @ nodes[i].A @ nodes[i].parts.U, nodes[i].parts.U) for i in island]
-        found = couple(parts, laplacian[np.ix_(rows, rows)], options.consensus)
-        if not found.beta < 0:  # instead of (40): the sign also says by how much
-            raise DesignError(_infeasible(island, found, nodes, options))
-        islands[island] = found
-        g |= dict(zip(island, map(float, found.g), strict=True))
-    return Network(nodes, {i: g[i] for i in ids}, islands)
-
-
-def _infeasible(island: tuple[int, ...], found: Coupling, nodes: Mapping[int, Local], options: Options) -> str:
-    who = f"node {island[0]}, which hears nobody" if len(island) == 1 else f"nodes {', '.join(map(str, island))}"
-    criterion = "(38)-(39)" if options.consensus == "paper" else "min ||A_u - Theta(g)||_2^2 - 1"
-    dimensions = ", ".join(str(nodes[i].parts.nu) for i in island)
-    advice = ["add edges or measurements", "let nodes know more inputs"]
-    if options.decomposition == "observability":
-        advice.append("try decomposition: detectability, which leaves less to the neighbours")
-    return (
-        f"the consensus design is infeasible: beta_u = {found.beta:+.3g} > 0 on {who} (the least value of {criterion}, "
-        f"lower bound {found.lower:+.3g}; nu = {dimensions}). It asks more than stability: that the sum of |U_i'e_i|^2 "
-        f"falls in every step. To change it: {'; '.join(advice)}; or use method: augmented, whose condition is exact."
-    )
 
 
 def _spec(scenario: Scenario, i: int, network: Network) -> NodeSpec:

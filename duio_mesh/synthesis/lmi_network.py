@@ -12,10 +12,13 @@ from duio_mesh.arrays import Array
 from duio_mesh.errors import DesignError
 from duio_mesh.geometry import RTOL, Decomposition
 from duio_mesh.geometry.subspace import norm
-from duio_mesh.scenario.model import Scenario
+from duio_mesh.scenario.model import Graph, Scenario
+from duio_mesh.spec import NodeSpec
 from duio_mesh.synthesis.consensus import Coupling
 from duio_mesh.synthesis.local_gain import radius
+from duio_mesh.synthesis.losses import losses, without
 from duio_mesh.synthesis.noise import noise_covariance
+from duio_mesh.synthesis.sampled import Coupled, error_system
 from duio_mesh.synthesis.uio import Decoupling
 
 
@@ -45,15 +48,14 @@ class Network(NamedTuple):
         return max(island.beta for island in self.islands.values())
 
 
-def error_matrix(scenario: Scenario, network: Network) -> Array:
-    """(N n, N n): e(k+1) = Phi e(k) + ... of all nodes, (31) in the original coordinates.
+def error_matrix_of(specs: Mapping[int, NodeSpec], graph: Graph) -> Array:
+    """(n |ids|, n |ids|): e(k+1) = Phi e(k) + ... of graph.ids, (31) in the original coordinates.
 
-    Block (i, j) is (P_i A - K_i C_i) [i = j] - g_i l_ij U_i U_i'.
+    Block (i, j) is (P_i A - K_i C_i) [i = j] - g_i l_ij U_i U_i', from the N and G that the nodes are given.
     """
-    nodes = network.nodes.values()
-    Phi = linalg.block_diag(*[own.A - own.K @ own.C for own in nodes])
-    G = linalg.block_diag(*[g * own.parts.U @ own.parts.U.T for g, own in zip(network.g.values(), nodes, strict=True)])
-    return np.asarray(Phi - G @ np.kron(scenario.graph.laplacian(), np.eye(scenario.plant.n)))
+    I = np.eye(specs[graph.ids[0]].n)
+    blocks = [Coupled(specs[i].matrices["N"], specs[i].matrices["G"], I, I) for i in graph.ids]
+    return error_system(blocks, graph.laplacian())
 
 
 def predicted_rms(scenario: Scenario, network: Network, Phi: Array) -> list[float]:
@@ -70,14 +72,17 @@ def predicted_rms(scenario: Scenario, network: Network, Phi: Array) -> list[floa
     return [float(np.sqrt(part.mean())) for part in np.split(np.diag(cov), len(network.nodes))]
 
 
-def certificate(scenario: Scenario, network: Network) -> dict[str, Any]:
-    """Plain data. Raises DesignError when a condition of the whole error system does not hold after all."""
+def certificate(scenario: Scenario, network: Network, Phi: Array, specs: Mapping[int, NodeSpec]) -> dict[str, Any]:
+    """Plain data; Phi (31) is that of the scenario's graph.
+
+    Raises DesignError when a condition of the whole error system does not hold after all."""
     nodes, islands = network.nodes, network.islands.values()
-    Phi = error_matrix(scenario, network)
     detectable = max(own.rho for own in nodes.values())
     undetectable = max(radius(island.phi) for island in islands)
     rho = radius(Phi)
-    conditions = _conditions(network, rho)
+    conditions = _conditions(network, rho, scenario.options.consensus)
+    if scenario.options.consensus == "robust":
+        conditions |= _losses(scenario.graph, specs)
     failed = [f"{name}: {c['value']:.6g}, needed {c['threshold']:g}" for name, c in conditions.items() if not c["ok"]]
     if failed:
         raise DesignError(f"the design does not hold what it should: {'; '.join(failed)}")
@@ -93,12 +98,12 @@ def certificate(scenario: Scenario, network: Network) -> dict[str, Any]:
         "beta_u": network.beta,
         "beta_u_lower_bound": max(island.lower for island in islands),
         "norm_phi_u": max(island.norm for island in islands),
-        "rate_bound": float(np.sqrt(max(0.0, 1 + network.beta))),
+        "rate_bound": None if network.beta >= 0 else float(np.sqrt(max(0.0, 1 + network.beta))),
         "beta_id": [own.beta for own in nodes.values()],
     }
 
 
-def _conditions(network: Network, rho: float) -> dict[str, dict[str, Any]]:
+def _conditions(network: Network, rho: float, consensus: str) -> dict[str, dict[str, Any]]:
     """What has to hold; rank margins are singular values free of units, of the worst node."""
     nodes = network.nodes
     margins = {
@@ -117,9 +122,23 @@ def _conditions(network: Network, rho: float) -> dict[str, dict[str, Any]]:
     found[f"(14)-(15), U_i invariant and unseen (node {worst})"] = _below(leak[worst], 1e-7)
     worst = max(nodes, key=lambda i: nodes[i].rho)
     found[f"A_id - K_id C_id is Schur (node {worst})"] = _below(nodes[worst].rho, 1.0)
-    found["(39)-(40), beta_u"] = _below(network.beta, 0.0)
+    if consensus != "schur":
+        found["(39)-(40), beta_u"] = _below(network.beta, 0.0)
     found["the error matrix of (31) is Schur"] = _below(rho, 1.0)
     return found
+
+
+def _losses(graph: Graph, specs: Mapping[int, NodeSpec]) -> dict[str, dict[str, Any]]:
+    """The largest eigenvalue of all graphs with one link lost, by the eigenvalues themselves."""
+    radii = {
+        loss.words(graph): radius(error_matrix_of(specs, without(graph, loss)))
+        for loss in losses(graph, 1)
+        if loss.links
+    }
+    if not radii:
+        return {}
+    worst = max(radii, key=lambda lost: radii[lost])
+    return {f"(31) is Schur with any one link lost ({worst})": _below(radii[worst], 1.0)}
 
 
 def _below(value: float, threshold: float) -> dict[str, Any]:

@@ -68,6 +68,20 @@ class Pencil:
         F = np.block([[self._square - cross - cross.T, Theta.T], [Theta, np.zeros_like(Theta)]])
         return float(linalg.eigvalsh(F, subset_by_index=(len(F) - 1, len(F) - 1))[0])
 
+    def reach(self, gamma: float) -> Array:
+        """(m,): |g_i| is at most this wherever the value is at most gamma; infinite where g_i has no effect here.
+
+        ||Theta|| <= gamma + ||A|| (norm), or, completing the square in the Schur complement, ||Theta - gamma A||^2 <=
+        gamma^2 + gamma (gamma - 1) ||A||^2 (paper).
+        """
+        size = norm(self.A)
+        if self.criterion == "norm":
+            Theta = gamma + size
+        else:
+            Theta = gamma * size + np.sqrt(gamma**2 + max(0.0, gamma * (gamma - 1)) * size**2)
+        own = np.array([norm(self.T[at]) if active else 0.0 for at, active in zip(self._at, self.active, strict=True)])
+        return np.asarray(np.divide(Theta, own, out=np.full(len(own), np.inf), where=own > 0))
+
     def factor(self, g: Array, gamma: float) -> Factored:
         """S at g and gamma."""
         if not gamma > 0:

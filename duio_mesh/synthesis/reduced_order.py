@@ -45,6 +45,8 @@ from duio_mesh.synthesis.sampled import (
     sampled,
 )
 
+RADIUS_OF = "sampled error system, per tick"
+
 
 class Options(HoldOptions):
     """The keys under ``observer:`` for ``method: reduced_order``."""
@@ -119,6 +121,15 @@ def design(scenario: Scenario, progress: Progress) -> Design:
     }
     specs = {i: _spec(scenario, i, node, steps[i], c) for i, node in nodes.items()}
     return Design(scenario, plant_spec(scenario), specs, certificate)
+
+
+def error_radius(design: Design, graph: Graph) -> float:
+    """Spectral radius of the sampled errors of graph.ids with the designed gains on another graph."""
+    n, blocks = design.scenario.plant.n, []
+    for i in graph.ids:
+        M = design.nodes[i].matrices
+        blocks.append(Coupled(M["Phi"], M["K"], np.eye(n), M["Os"][:n]))
+    return radius(error_system(blocks, graph.laplacian()))
 
 
 def _unknown_input(scenario: Scenario) -> tuple[Array, list[str]]:

@@ -94,10 +94,13 @@ class Coupled(NamedTuple):
 
 def error_system(nodes: Sequence[Coupled], laplacian: Array) -> Array:
     """The stacked error matrix: blkdiag(F_i) - blkdiag(K_i R_i) (L kron I) blkdiag(X_i), in the order of ``nodes``."""
-    n = nodes[0].X.shape[0]
-    coupling = linalg.block_diag(*(node.K @ node.R for node in nodes))
-    X = linalg.block_diag(*(node.X for node in nodes))
-    return np.asarray(linalg.block_diag(*(node.F for node in nodes)) - coupling @ np.kron(laplacian, np.eye(n)) @ X)
+    ends = np.cumsum([len(node.F) for node in nodes])
+    at = [slice(int(end) - len(node.F), int(end)) for end, node in zip(ends, nodes, strict=True)]
+    Phi: Array = linalg.block_diag(*(node.F for node in nodes))
+    pull = [node.K @ node.R for node in nodes]
+    for i, j in zip(*np.nonzero(laplacian), strict=True):
+        Phi[at[i], at[j]] -= laplacian[i, j] * pull[i] @ nodes[j].X
+    return Phi
 
 
 def radius(M: Array) -> float:
