@@ -150,8 +150,7 @@ class Recording:
             for k in range(first * window, min(last * window, self._spec.steps), window):
                 self._give(None, k, truth[k : k + window])
                 for i, rows in estimates.items():
-                    for a, b in self._pairing.known[i].gaps(k, min(k + window, len(rows))):
-                        self._give(i, a, rows[a:b])
+                    self._give(i, k, rows[k : k + window])
 
     def close(self) -> None:
         """Mark what is still missing, write everything and the footer. Raises OSError when the disk would not take it.

@@ -123,10 +123,19 @@ def test_gaps_are_filled_from_files_and_what_nobody_wrote_stays_missing(tmp_path
         recording.estimates(1, 0, rows[1][:30])  # before its truth
         recording.truth(5, truth[5:20])
         recording.estimates(2, 10, rows[2][10:20])
-        recording.fill(truth, {1: rows[1], 2: rows[2][:50], 3: lost})
-        assert recording.missing() == {2: [(50, 60)], 3: [(45, 60)]}
+        known = truth.copy()
+        known[:3] = np.nan
+        recording.fill(known, {1: rows[1], 2: rows[2][:50], 3: lost})
+        assert recording.missing() == {
+            None: [(0, 3)],
+            1: [(0, 3)],
+            2: [(0, 3), (50, 60)],
+            3: [(0, 3), (45, 60)],
+        }
     for i, steps in ((1, 60), (2, 50), (3, 45)):
-        assert read_series(tmp_path / "r.rrd", f"/error/node_{i}")[0].tolist() == list(range(steps))
+        k, values = read_series(tmp_path / "r.rrd", f"/error/node_{i}")
+        assert k.tolist() == list(range(3, steps))
+        np.testing.assert_allclose(10**values, np.linalg.norm(rows[i] - truth, axis=1)[3:steps])
         assert read_series(tmp_path / "r.rrd", f"/state/x2/node_{i}")[0].tolist() == list(range(steps))
 
 
