@@ -64,7 +64,11 @@ def _heat(p: argparse.ArgumentParser) -> None:
         help="rooms that a node measures beside those that it must (default 0). With some, every node filters by "
         "itself (decomposition: detectability, local_gain: h2), without large matrix inequalities",
     )
-    expect = "The gains of lmi without --own-rooms come from matrix inequalities of size 2 x nodes x rooms."
+    expect = (
+        "Without --own-rooms the design of lmi solves a matrix inequality of size 2 x nodes x (rooms - measurements): "
+        "seconds for 6x6 rooms and 6 nodes, growing with the cube. With --own-rooms there is none. augmented handles "
+        "some 100 rooms x nodes. Larger systems are written all the same."
+    )
     _common(p, METHODS, "ring", expect)
 
     def make(a: argparse.Namespace) -> Document:
@@ -78,7 +82,10 @@ def _platoon(p: argparse.ArgumentParser) -> None:
     from duio_mesh.generate.platoon import METHODS, Platoon, document
 
     p.add_argument("--vehicles", type=_count, required=True, metavar="V", help="vehicles; each is a node")
-    _common(p, METHODS, "path", "")
+    expect = (
+        "The design takes seconds, but half a minute and more on random graphs of 32 nodes and more (fusion: admm)."
+    )
+    _common(p, METHODS, "path", expect)
     p.set_defaults(make=lambda a: document(Platoon(a.vehicles, a.graph, a.method, a.seed)))
 
 
@@ -88,7 +95,11 @@ def _swing(p: argparse.ArgumentParser) -> None:
     p.add_argument("--case", type=_count, choices=tuple(MACHINES), required=True, help="the IEEE case")
     p.add_argument("--nodes", type=_count, metavar="N", help="observers, at most and by default one per machine")
     p.add_argument("--loads", type=_count, default=1, metavar="Q", help="loads that nobody meters (default 1)")
-    _common(p, METHODS, "ring", "")
+    expect = (
+        "Needs the package PYPOWER: pip install 'duio_mesh[grid]'. --nodes times --loads should be at least the number "
+        "of machines, 4 or 9. The design takes seconds; that of augmented for case 39 takes more than a minute."
+    )
+    _common(p, METHODS, "ring", expect)
     p.set_defaults(make=lambda a: document(Swing(a.case, a.nodes, a.loads, a.graph, a.method, a.seed)))
 
 
