@@ -17,6 +17,7 @@ from duio_mesh import launcher
 from duio_mesh.launcher import RunResult
 from duio_mesh.synthesis.design import Design
 
+SLOW = 0.1  # of an error left by a step that starts afresh: the estimate is not worth its name
 FEW = 8  # nodes whose errors are shown one by one
 
 _out = Console(highlight=False)
@@ -121,6 +122,8 @@ def _contingency(found: Mapping[str, Any]) -> None:
         if case["failing"]:
             islands = " and ".join(_text(ids) for ids in case["failing"])
             words = f"[red]does not:[/] nodes {escape(islands)}"
+        elif case.get("left", 0) > SLOW:
+            words = f"[yellow]too slowly:[/] a step leaves {case['left']:.0%} of the error"
         table.add_row(case["lost"], _text(case["radius"]), words)
     _out.print(table)
     lost = sum(bool(case["failing"]) for case in found["cases"])

@@ -14,7 +14,7 @@ from duio_mesh.errors import DesignError
 from duio_mesh.geometry import stable_radius
 from duio_mesh.scenario.model import Scenario
 from duio_mesh.spec import NodeSpec
-from duio_mesh.synthesis.admm_contingency import RADIUS_OF, error_radius
+from duio_mesh.synthesis.admm_contingency import RADIUS_OF, error_left, error_radius
 from duio_mesh.synthesis.admm_local import LEAST_CURVATURE, Local, check_joint, facts, local_estimates, noise_gain
 from duio_mesh.synthesis.admm_options import Options
 from duio_mesh.synthesis.admm_rates import (
@@ -28,7 +28,7 @@ from duio_mesh.synthesis.admm_rates import (
 )
 from duio_mesh.synthesis.design import Design, Progress, node_spec, plant_spec
 
-__all__ = ["RADIUS_OF", "Options", "design", "error_radius"]
+__all__ = ["RADIUS_OF", "Options", "design", "error_left", "error_radius"]
 
 _ROUNDING = 1e-6  # finite_time must be exact to this, or the graph has too many different eigenvalues
 

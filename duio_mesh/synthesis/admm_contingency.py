@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from duio_mesh.arrays import Array
-from duio_mesh.observers.fusion import step_size
+from duio_mesh.observers.fusion import fusion_rounds, step_size
 from duio_mesh.scenario.model import Graph
 from duio_mesh.synthesis.admm_options import Options
-from duio_mesh.synthesis.admm_rates import Island, admm_matrix, relaxed_matrix
+from duio_mesh.synthesis.admm_rates import Island, admm_matrix, relaxed_matrix, spectrum
 from duio_mesh.synthesis.design import Design
 
 RADIUS_OF = "fusion, per exchange (0: exact after its rounds; none: it ends in something else than the state)"
@@ -35,6 +35,16 @@ def error_radius(design: Design, graph: Graph) -> float:
     inverse = left.inverse if options.normalised else None
     steps = [step_size(part, inverse, options.gamma, d) for part, d in zip(left.T, degrees, strict=True)]
     return _radius(admm_matrix(left, options, options.alpha_factor * np.array(steps)))
+
+
+def error_left(design: Design, graph: Graph) -> float:
+    """About what is left of the fusion's error after the rounds of one step: radius to their power."""
+    options: Options = design.scenario.options
+    designed = design.scenario.graph
+    home = next(ids for ids in designed.islands() if graph.ids[0] in ids)
+    at = [designed.ids.index(i) for i in home]
+    eigenvalues = spectrum(designed.laplacian()[np.ix_(at, at)])
+    return error_radius(design, graph) ** fusion_rounds({**options.model_dump(), "eigenvalues": eigenvalues})
 
 
 def _radius(M: Array) -> float:

@@ -2,7 +2,8 @@
 
 A method takes part by one function in its synthesis file, ``error_radius(design, graph) -> float``: the spectral radius
 of the errors of graph.ids under the designed gains, with the graph's Laplacian in place of the designed one; below 1
-they go to zero. ``RADIUS_OF`` beside it says of what it is the radius. The graph is one island.
+they go to zero. ``RADIUS_OF`` beside it says of what it is the radius. The graph is one island. A method that starts
+afresh in every step has ``error_left(design, graph)`` too: how much of the error is left at the end of a step.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ def contingency(design: Design, number: int = 1, progress: Progress = lambda _: 
     ``nominal``, ``nominal_failing``: as a case, without a loss. ``cases``: per loss ``lost`` in words, ``links`` and
     ``nodes``, ``radius`` (None when the estimates go to something wrong), ``reconstructs``, and ``failing``: the
     islands whose errors do not contract. ``worst``: what is lost in the case with the largest radius. ``survives``:
-    all cases reconstruct.
+    all cases reconstruct. ``left``, of methods that start afresh in every step: what a step leaves of the error.
     Raises DesignError when the method has no error matrix to offer or ``number`` is less than 1.
     """
     method = importlib.import_module(f"duio_mesh.synthesis.{design.scenario.method}")
@@ -50,19 +51,23 @@ def contingency(design: Design, number: int = 1, progress: Progress = lambda _: 
             known[island] = float(method.error_radius(design, island))
         return known[island]
 
+    leaves = getattr(method, "error_left", None)
+
+    def left_over(island: Graph) -> float:
+        return float(leaves(design, island)) if leaves else 0.0
+
     def case(loss: Loss) -> dict[str, Any]:
         left = without(graph, loss)
         radii = {island: radius(restricted(left, island)) for island in left.islands()}
         failing = [list(island) for island, value in radii.items() if not value < CONTRACTS]
-        largest = max(radii.values())
         return {
             "lost": loss.words(graph),
             "links": [list(link) for link in loss.links],
             "nodes": list(loss.nodes),
-            "radius": largest if np.isfinite(largest) else None,
+            "radius": _plain(max(radii.values())),
             "reconstructs": not failing,
             "failing": failing,
-        }
+        } | ({"left": _plain(max(left_over(restricted(left, ids)) for ids in radii))} if leaves else {})
 
     progress("contingency: nothing lost")
     nominal = case(Loss())
@@ -79,3 +84,8 @@ def contingency(design: Design, number: int = 1, progress: Progress = lambda _: 
         "worst": worst["lost"] if worst else None,
         "survives": all(c["reconstructs"] for c in cases),
     }
+
+
+def _plain(value: float) -> float | None:
+    """JSON has no infinity."""
+    return value if np.isfinite(value) else None
