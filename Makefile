@@ -4,7 +4,7 @@ VENV := .venv
 PY := $(VENV)/bin/python
 TOPOLOGY ?= topologies/partitioned.yaml
 
-.PHONY: help run test check lint types schema bench clean
+.PHONY: help run test check lint types schema bench reliability clean
 
 help: ## this list
 	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 10
@@ -32,6 +32,9 @@ bench: $(VENV)/ready ## speed, as ratios inside one interleaved run; the tables 
 	$(PY) bench/exchange.py --repeat 3
 	$(PY) bench/admm.py
 	$(PY) bench/startup.py
+
+reliability: $(VENV)/tests ## what every observer makes of every fault; the table of docs/reliability.md
+	OPENBLAS_NUM_THREADS=1 $(PY) bench/reliability.py --write
 
 clean: ## remove the virtual environment and caches, keep runs/
 	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -3,7 +3,7 @@
     python bench/reliability.py            print the table
     python bench/reliability.py --write    and put it into docs/reliability.md
 
-Ends with exit code 1 when an estimate is wrong and not flagged. Same seeds, same bits; takes about a minute.
+Ends with exit code 1 when an estimate is wrong and not flagged. Same seeds, same bits; takes a minute of CPU time.
 """
 
 from __future__ import annotations
