@@ -66,8 +66,8 @@ def _heat(p: argparse.ArgumentParser) -> None:
     )
     expect = (
         "Without --own-rooms the design of lmi solves a matrix inequality of size 2 x nodes x (rooms - measurements): "
-        "seconds for 6x6 rooms and 6 nodes, growing with the cube. With --own-rooms there is none. augmented handles "
-        "some 100 rooms x nodes. Larger systems are written all the same."
+        "seconds for 6x6 rooms and 6 nodes, a minute for 8x8 and 16, growing with the cube. With "
+        "--own-rooms there is none. augmented handles some 100 rooms x nodes. Larger systems are written all the same."
     )
     _common(p, METHODS, "ring", expect)
 
