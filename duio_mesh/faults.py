@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 from typing import Literal, NamedTuple
 
 ALWAYS = (0, 1 << 32)  # steps are unsigned 32-bit numbers on the wire
+COUNTED = ("lost", "corrupt", "late", "duplicate")  # what a receiver counts of its in-edges' frames
 MAX_DELAY = 1000  # steps or rounds
 
 _KEY = struct.Struct("<IQQII")  # rule, source, target, step, round
@@ -234,7 +235,7 @@ class Reception:
         }
         self._tick = 0  # exchanges so far
         self._held: list[_Held] = []
-        self.counts = {"lost": 0, "corrupt": 0, "late": 0, "duplicate": 0}
+        self.counts = dict.fromkeys(COUNTED, 0)
         """Frames so far, by what happened to them."""
 
     def next(self, k: int, r: int) -> Arrivals:

@@ -12,13 +12,14 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, Protocol, TypeAlias
 
 import numpy as np
 
 from duio_mesh import credentials
 from duio_mesh.arrays import Array
 from duio_mesh.errors import RunError
+from duio_mesh.faults import COUNTED
 from duio_mesh.report.description import describe
 from duio_mesh.report.metrics import metrics
 from duio_mesh.report.trace_file import write_trace
@@ -43,6 +44,18 @@ class Progress:
 
 
 Show: TypeAlias = Callable[[Progress], None]
+
+
+class Watcher(Protocol):
+    """Whoever wants to know where to watch live."""
+
+    def started(self, url: str) -> None:
+        """The live server is there."""
+        ...
+
+    def ended(self, url: str) -> None:
+        """The run is over; the server stays until this returns."""
+        ...
 
 
 def ignore(_: Progress) -> None:
@@ -76,6 +89,7 @@ class Launch:
         self._design, self._folder, self._supervisor = design, folder, supervisor
         self._record, self._live = record, live
         self._sizes = estimate_sizes(design)
+        self._url = ""  # of the live server, once the recorder has said it
         self._wiring = Wiring(design, folder.keys, record=record, address=address)
 
     def specs(self) -> dict[str, NodeSpec | PlantSpec | RecorderSpec]:
@@ -107,7 +121,7 @@ class Launch:
             )
         return specs
 
-    def go(self, show: Show, hold: Callable[[str], None] | None) -> None:
+    def go(self, show: Show, watcher: Watcher | None) -> None:
         """Start everybody and stay until plant and nodes are done. Raises RunError, or KeyboardInterrupt."""
         try:
             for who, spec in self.specs().items():
@@ -115,17 +129,20 @@ class Launch:
                 kind = who.split("-")[0]
                 logs = (self._folder.log(who, "jsonl"), self._folder.log(who, "err"))
                 self._supervisor.start(who, kind, self._folder.spec(who), *logs)
-            self._supervisor.watch(lambda: self._look(show), self._design.plant.deadline)
+            self._supervisor.watch(lambda: self._look(show, watcher), self._design.plant.deadline)
             if self._record:
-                if hold and (url := self._supervisor.processes["recorder"].said.get("url")):
-                    hold(url)
+                if watcher and self._url:
+                    watcher.ended(self._url)
                 rows = self._design.plant.steps * len(self._sizes)
                 self._supervisor.finish("recorder", CLOSING + rows / CLOSING_ROWS)
         finally:
             self._wiring.release()
 
-    def _look(self, show: Show) -> int:
+    def _look(self, show: Show, watcher: Watcher | None) -> int:
         """Show the progress; how many bytes all journals have grown to."""
+        if watcher and not self._url and (url := self._supervisor.processes["recorder"].said.get("url")):
+            self._url = url
+            watcher.started(url)
         files = {i: self._folder.rows(f"node-{i}") for i in self._sizes}
         sizes = {i: path.stat().st_size if path.exists() else 0 for i, path in files.items()}
         steps = {i: size // (8 * self._sizes[i]) for i, size in sizes.items()}
@@ -157,14 +174,14 @@ def run(
     record: bool = True,
     live: bool = False,
     show: Show = ignore,
-    hold: Callable[[str], None] | None = None,
+    watcher: Watcher | None = None,
     supervisor: Supervisor | None = None,
     address: str = LOOPBACK,
 ) -> RunResult:
     """Run a design as real processes over Zenoh and gather its results into the run folder.
 
-    ``out``: the folder (default runs/<name>/<UTC time>); ``hold`` is called with the live server's address when the
-    nodes are done, and the server stays until it returns; ``supervisor``: one that was started earlier, to save its
+    ``out``: the folder (default runs/<name>/<UTC time>); ``watcher`` is told where to watch live and
+    when the nodes are done; ``supervisor``: one that was started earlier, to save its
     start-up time; ``address``: where the processes listen. Raises RunError when a process is lost or a deadline passes
     (the folder then holds what there is), ScenarioError when they may not listen there.
     """
@@ -177,7 +194,7 @@ def run(
         begin = time.monotonic()
         failed = ""
         try:
-            launch.go(show, hold)
+            launch.go(show, watcher)
         except RunError as e:
             failed = str(e)
         except KeyboardInterrupt:
@@ -204,7 +221,24 @@ def run_in_process(
     trace = simulate(design, lambda steps: show(Progress(steps, {})))
     took = time.monotonic() - begin
     rounds = len(trace.t)
-    return _finish(folder, design, trace, {"rounds": rounds, "rounds_per_second": rounds / took}, record=record)
+    counts: dict[str, Any] = {"rounds": rounds, "rounds_per_second": rounds / took}
+    marked = () if trace.flagged is None else trace.flagged.sum(axis=1).tolist()
+    flags = dict(zip(trace.node_ids.tolist(), marked, strict=False))
+    warnings = _flagged(design, flags, counts)
+    return _finish(folder, design, trace, counts, record=record, warnings=warnings)
+
+
+def _flagged(design: Design, flags: Mapping[int, int], counts: dict[str, Any]) -> tuple[str, ...]:
+    """Under faults, count the estimates that their own nodes mark and warn of them: the verdict does not see them."""
+    if not design.scenario.faults.links:
+        return ()
+    counts["flagged"] = {str(i): flags.get(i, 0) for i in design.nodes}
+    steps = design.scenario.run.steps
+    return tuple(
+        f"node-{i} flags {count} of its {steps} estimates: messages were missing that it needs for them"
+        for i, count in flags.items()
+        if count
+    )
 
 
 def write_inputs(folder: RunFolder, design: Design) -> None:
@@ -228,7 +262,7 @@ def gather(folder: RunFolder, design: Design, supervisor: Supervisor, seconds: f
     nodes = [said[f"node-{i}"] for i in design.nodes if said.get(f"node-{i}")]
     rounds = max((node["rounds"] for node in nodes), default=0)
     took = max((node["seconds"] for node in nodes), default=seconds)
-    counts = {
+    counts: dict[str, Any] = {
         "rounds": rounds,
         "rounds_per_second": rounds / took if took else 0.0,
         "messages": sum(node["frames"] for node in nodes),
@@ -237,6 +271,10 @@ def gather(folder: RunFolder, design: Design, supervisor: Supervisor, seconds: f
     }
     recorder = supervisor.processes.get("recorder")
     warnings = [f"{p.who}: {text}" for p in supervisor.processes.values() for text in p.warnings]
+    flags = {i: said[f"node-{i}"]["flagged"] for i in design.nodes if said.get(f"node-{i}")}
+    warnings += _flagged(design, flags, counts)
+    if design.scenario.faults.links:
+        counts["faults"] = {what: sum(node["faults"].get(what, 0) for node in nodes) for what in COUNTED}
     lost = recorder is not None and not recorder.done
     if recorder and lost:
         warnings.append(f"{recorder.death()}; the recording was made from the trace instead")

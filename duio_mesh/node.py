@@ -21,7 +21,7 @@ from duio_mesh.mesh import Mesh
 from duio_mesh.mesh.faulty import LONG_WAY, Arrived, FaultyExchange
 from duio_mesh.mesh.lockstep import Exchange, Line, Lockstep
 from duio_mesh.observers import Observer, make_observer
-from duio_mesh.observers.absence import Late, take_late
+from duio_mesh.observers.absence import Late, flagged, take_late
 from duio_mesh.observers.base import reader
 from duio_mesh.observers.watch import watcher
 from duio_mesh.process import Report, main
@@ -69,6 +69,7 @@ def run(spec: NodeSpec, report: Report) -> None:
         zeros = np.zeros(spec.n)
         estimates, samples = reader(observer), _samples(lockstep, plant, spec)
         watched = watcher(observer)
+        doubtful = 0  # estimates that the observer marks
         rounds, promised, begin, cpu = 0, spec.credit, time.monotonic(), time.process_time()
         beat = begin + BEAT
         with lockstep, Journal(spec.output, row, trace) as journal:
@@ -86,6 +87,7 @@ def run(spec: NodeSpec, report: Report) -> None:
                         report.beat()
                 if len(figures := watched()):
                     journal.aside(spec.options["watch_step"], figures)
+                doubtful += flagged(observer) * (done - k)
                 for estimate in estimates():
                     if not isfinite(zeros.dot(estimate.state)):
                         raise RunError(f"node-{i}: the estimate overflowed at step {k}; is the plant unstable?")
@@ -101,6 +103,8 @@ def run(spec: NodeSpec, report: Report) -> None:
             cpu_seconds=time.process_time() - cpu,
             frames=told.frames,
             rejected=mesh.rejections(),
+            flagged=doubtful,
+            faults=dict(exchange.counts) if isinstance(exchange, FaultyExchange) else {},
         )
 
 

@@ -36,12 +36,17 @@ def design_of(name: str, faults: dict[str, Any], **changes: Any) -> Any:
 
 def same(design: Any) -> duio_mesh.RunResult:
     """Run it both ways; the mesh's result."""
-    expected = duio_mesh.simulate(design).arrays()
+    oracle = duio_mesh.simulate(design)
+    expected = oracle.arrays()
     result = duio_mesh.run(design, "run", record=False)
     found = result.trace.arrays()
     assert found.keys() == expected.keys()
     for array, values in expected.items():
         assert found[array].tobytes() == values.tobytes(), array
+    assert oracle.flagged is not None
+    counted = {str(i): int(flags.sum()) for i, flags in zip(oracle.node_ids, oracle.flagged, strict=True)}
+    assert result.metrics["flagged"] == counted
+    assert sum("flags" in warning for warning in result.warnings) == sum(count > 0 for count in counted.values())
     return result
 
 
@@ -49,6 +54,8 @@ def same(design: Any) -> duio_mesh.RunResult:
 def test_every_method_under_everything(name: str) -> None:
     result = same(design_of(name, FAULTS["everything"]))
     refused = result.metrics["rejected"]
+    faults = result.metrics["faults"]
+    assert all(faults[what] > 0 for what in ("lost", "corrupt", "late", "duplicate"))
     assert "checksum" in str(refused)  # flipped bits are caught by the frame check
     assert "seen before" in str(refused)  # and second copies dropped
 
