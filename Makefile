@@ -29,7 +29,7 @@ schema: $(VENV)/ready ## rewrite the JSON schema that editors use for topology f
 
 bench: $(VENV)/ready ## speed, as ratios inside one interleaved run; the tables of docs/performance.md
 	-$(PY) -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[bench]'
-	$(PY) bench/exchange.py --repeat 3
+	$(PY) bench/exchange.py --repeat 3 --rounds 4000
 	$(PY) bench/admm.py
 	$(PY) bench/startup.py
 
