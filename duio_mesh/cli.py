@@ -91,7 +91,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except (ScenarioError, DesignError) as e:
         print(e, file=sys.stderr)
         return IMPOSSIBLE
-    except RunError as e:
+    except (RunError, OSError) as e:  # OSError: a full disk, a folder that may not be written
         print(f"run failed: {e}", file=sys.stderr)
         return FAILED
     except KeyboardInterrupt:
