@@ -215,7 +215,7 @@ class Run(Strict):
     step: Annotated[Seconds | None, Field(description="seconds per exchange of a continuous plant")] = None
     convergence: Convergence
     deadline: Annotated[float, Field(gt=0, le=86_400, description="seconds to wait for any one message")] = 5.0
-    window: Annotated[int, Field(ge=1, le=100_000, description="steps that the plant may be ahead")] = 64
+    window: Annotated[int, Field(ge=1, le=100_000, description="steps that the plant may be ahead")] = 256
     batch: Annotated[
         int, Field(ge=1, le=10_000, description="steps fused as one block (admm only); estimates come so much late")
     ] = 1
