@@ -48,7 +48,7 @@ def test_a_run_that_does_not_converge_exits_1(capsys: pytest.CaptureFixture[str]
 
 
 def test_steps_and_seed_are_overrides() -> None:
-    assert cli.main([PARTITIONED, "--in-process", "--no-record", "--steps", "50", "--seed", "7", "--out", "a"]) in (0, 1)
+    assert cli.main([PARTITIONED, "--in-process", "--no-record", "--steps=50", "--seed=7", "--out=a"]) in (0, 1)
     metrics = json.loads(Path("a/metrics.json").read_text())
     assert (metrics["steps"], metrics["seed"]) == (50, 7)
 
