@@ -5,8 +5,11 @@ An observer is a pure step machine: no I/O, no clock, no randomness, numpy only.
     observer.sample(y, u)                  # data of step k
     for r in range(observer.rounds):
         out = observer.message(r)          # for every out-neighbour, the same vector
-        observer.exchange(r, received)     # {in-neighbour: vector}, ascending ids; under faults some may be missing
+        observer.exchange(r, received)     # {in-neighbour: vector of this very round}, ascending ids
     observer.estimate()                    # of x(k)
+
+Under faults some neighbours are missing from ``received``, vectors of earlier rounds may be handed over before it, and
+the newest estimate may be marked: see ``absence``.
 
 The vector returned by ``message`` may be a buffer that the next call overwrites: senders copy it, receivers own theirs.
 """
