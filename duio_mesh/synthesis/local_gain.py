@@ -52,7 +52,8 @@ def worst_gain(system: Subsystem, K: Array) -> float:
     if not A.size:
         return 0.0
     closed = A - K @ C
-    angles = np.concatenate([np.linspace(0, np.pi, 65), np.abs(np.angle(np.linalg.eigvals(closed)))])
+    resonances = np.abs(np.angle(np.linalg.eigvals(closed)))
+    angles = np.concatenate([np.linspace(0, np.pi, 65), np.unique(resonances.round(14))])  # a conjugate pair has one
     resolvents = np.exp(1j * angles)[:, None, None] * np.eye(len(A)) - closed
     inputs = np.hstack([K, -F])
     responses = np.linalg.solve(resolvents, np.broadcast_to(inputs, (len(angles), *inputs.shape)))
@@ -130,9 +131,9 @@ def _central_gain(system: Subsystem, beta: float, confirmed: bool) -> Array | No
             K = np.linalg.solve(np.eye(len(C)) + C @ Y @ C.T, C @ Y @ A.T).T
             closed = A - K @ C
             balance = F @ F.T + system.stir**2 * I + K @ K.T + closed @ Y @ closed.T
+            if not (np.linalg.norm(balance - X) <= 1e-5 * np.linalg.norm(X) and radius(closed) < 1):
+                return None
     except (np.linalg.LinAlgError, ValueError):  # singular, X >= beta^2 I somewhere, or no longer finite
-        return None
-    if not (norm(balance - X) <= 1e-5 * norm(X) and radius(closed) < 1):
         return None
     missed = confirmed and worst_gain(system, _array(K)) > beta * (1 + TOLERANCE)
     return None if missed else _array(K)
