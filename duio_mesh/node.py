@@ -10,7 +10,9 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Sequence
 from functools import partial
+from itertools import chain
 from math import isfinite
+from typing import Any
 
 import numpy as np
 
@@ -31,81 +33,88 @@ NO_VECTOR = np.zeros(0)
 BEAT = 0.5  # seconds between signs of life inside a step
 
 
-def _samples(lockstep: Lockstep, plant: Line, spec: NodeSpec) -> Iterator[Array]:
+def run(spec: NodeSpec, report: Report) -> None:
+    """Run one node for ``spec.steps`` steps. Raises RunError when a neighbour or the plant is lost or late."""
+    observer = make_observer(spec)
+    row = sum(part.size for part in observer.estimate())
+    with Mesh(spec.wire, f"node-{spec.id}", report.warn) as mesh:
+        links = Links(spec, mesh, observer)
+        mesh.watch(links.lockstep.noticed)
+        mesh.meet()
+        report("ready")
+        with links.lockstep, Journal(spec.output, row, links.trace) as journal:
+            figures = live(spec, observer, links, journal, report)
+    report("done", **figures, frames=links.told.frames, rejected=mesh.rejections(), faults=links.faults())
+
+
+class Links:
+    """Everything that one node hears and tells."""
+
+    def __init__(self, spec: NodeSpec, mesh: Mesh, observer: Observer) -> None:
+        i, keys, window = spec.id, mesh.keys, spec.window
+        room = LONG_WAY if spec.without else 0
+        self.lockstep = Lockstep(mesh, spec.deadline)
+        self.plant = Line(mesh, keys.plant(i), f"plant -> {i}", "plant", ("plant", i), window)
+        heard = {
+            j: Line(mesh, keys.edge(j, i), f"edge {j} -> {i}", f"node-{j}", (j, i), window, room) for j in spec.hears
+        }
+        self.told = mesh.speak([(keys.edge(i, j), f"edge {i} -> {j}", (i, j)) for j in spec.tells])
+        self.credit = mesh.speak([(keys.credit(i), f"{i} -> plant", (i, "plant"))])
+        self.trace = mesh.speak([(keys.trace(i), f"{i} -> recorder", None)], drop=True)
+        self.exchange: Exchange | FaultyExchange = Exchange(self.lockstep, self.told, heard)
+        if spec.without:  # faults are made on purpose
+            self.exchange = FaultyExchange(spec, self.lockstep, self.told, heard, partial(_hand_over, observer))
+
+    def faults(self) -> dict[str, int]:
+        """How many frames met which fault."""
+        return dict(self.exchange.counts) if isinstance(self.exchange, FaultyExchange) else {}
+
+
+def live(spec: NodeSpec, observer: Observer, links: Links, journal: Journal, report: Report) -> dict[str, Any]:
+    """The steps of a node, and what they came to."""
+    p, exchange, zeros = spec.p, links.exchange, np.zeros(spec.n)
+    estimates, watched = reader(observer), watcher(observer)
+    samples = _samples(links, spec)
+    samples = chain((next(samples),), samples)  # the first may take its time: the others are still starting
+    begin, cpu = time.monotonic(), time.process_time()
+    rounds, doubtful, promised, beat = 0, 0, spec.credit, begin + BEAT
+    for k in range(0, spec.steps, spec.batch):
+        done = min(k + spec.batch, spec.steps)
+        for _ in range(k, done):
+            sample = next(samples)
+            observer.sample(sample[:p], sample[p:])
+        for r in range(observer.rounds):
+            observer.exchange(r, exchange(k, r, observer.message(r)))
+            rounds += 1
+            if (now := time.monotonic()) > beat:  # a step of many rounds may last longer than any deadline
+                beat = now + BEAT
+                links.credit.send(k, 0, NO_VECTOR)
+                report.beat()
+        if len(figures := watched()):
+            journal.aside(spec.options["watch_step"], figures)
+        doubtful += flagged(observer) * (done - k)  # estimates that the observer marks
+        for estimate in estimates():
+            if not isfinite(zeros.dot(estimate.state)):
+                raise RunError(f"node-{spec.id}: the estimate overflowed at step {k}; is the plant unstable?")
+            journal.add(estimate)
+        if done >= promised or done == spec.steps:
+            promised = done + spec.credit
+            links.credit.send(done, 0, NO_VECTOR)
+    seconds, cpu_seconds = time.monotonic() - begin, time.process_time() - cpu
+    return {"steps": spec.steps, "rounds": rounds, "seconds": seconds, "cpu_seconds": cpu_seconds, "flagged": doubtful}
+
+
+def _samples(links: Links, spec: NodeSpec) -> Iterator[Array]:
     """[y_i(k); u_i(k)] for k = 0, 1, ...: the plant sends a few steps in one frame."""
     size = spec.p + spec.m
     for k in range(0, spec.steps, spec.block):
         count = min(spec.block, spec.steps - k)
-        yield from lockstep.take(plant, k, 0, count * size).reshape(count, size)
+        yield from links.lockstep.take(links.plant, k, 0, count * size).reshape(count, size)
 
 
 def _hand_over(observer: Observer, k: int, arrived: Sequence[Arrived]) -> None:
     """Give the observer the older frames that arrive in step k."""
     take_late(observer, [Late(stamp.source, k - stamp.k, stamp.r, vector) for stamp, vector in arrived])
-
-
-def run(spec: NodeSpec, report: Report) -> None:
-    """Run one node for ``spec.steps`` steps. Raises RunError when a neighbour or the plant is lost or late."""
-    i, p, window = spec.id, spec.p, spec.window
-    observer = make_observer(spec)
-    with Mesh(spec.wire, f"node-{i}", report.warn) as mesh:
-        keys = mesh.keys
-        plant = Line(mesh, keys.plant(i), f"plant -> {i}", "plant", ("plant", i), window)
-        room = LONG_WAY if spec.without else 0
-        heard = {
-            j: Line(mesh, keys.edge(j, i), f"edge {j} -> {i}", f"node-{j}", (j, i), window, room) for j in spec.hears
-        }
-        told = mesh.speak([(keys.edge(i, j), f"edge {i} -> {j}", (i, j)) for j in spec.tells])
-        credit = mesh.speak([(keys.credit(i), f"{i} -> plant", (i, "plant"))])
-        trace = mesh.speak([(keys.trace(i), f"{i} -> recorder", None)], drop=True)
-        lockstep = Lockstep(mesh, spec.deadline)
-        exchange: Exchange | FaultyExchange = Exchange(lockstep, told, heard)
-        if spec.without:  # faults are made on purpose
-            exchange = FaultyExchange(spec, lockstep, told, heard, partial(_hand_over, observer))
-        mesh.watch(lockstep.noticed)
-        mesh.meet()
-        report("ready")
-        row = sum(part.size for part in observer.estimate())
-        zeros = np.zeros(spec.n)
-        estimates, samples = reader(observer), _samples(lockstep, plant, spec)
-        watched = watcher(observer)
-        doubtful = 0  # estimates that the observer marks
-        rounds, promised, begin, cpu = 0, spec.credit, time.monotonic(), time.process_time()
-        beat = begin + BEAT
-        with lockstep, Journal(spec.output, row, trace) as journal:
-            for k in range(0, spec.steps, spec.batch):
-                done = min(k + spec.batch, spec.steps)
-                for _ in range(k, done):
-                    sample = next(samples)
-                    observer.sample(sample[:p], sample[p:])
-                for r in range(observer.rounds):
-                    observer.exchange(r, exchange(k, r, observer.message(r)))
-                    rounds += 1
-                    if (now := time.monotonic()) > beat:  # a step of many rounds may last longer than any deadline
-                        beat = now + BEAT
-                        credit.send(k, 0, NO_VECTOR)
-                        report.beat()
-                if len(figures := watched()):
-                    journal.aside(spec.options["watch_step"], figures)
-                doubtful += flagged(observer) * (done - k)
-                for estimate in estimates():
-                    if not isfinite(zeros.dot(estimate.state)):
-                        raise RunError(f"node-{i}: the estimate overflowed at step {k}; is the plant unstable?")
-                    journal.add(estimate)
-                if done >= promised or done == spec.steps:
-                    promised = done + spec.credit
-                    credit.send(done, 0, NO_VECTOR)
-        report(
-            "done",
-            steps=spec.steps,
-            rounds=rounds,
-            seconds=time.monotonic() - begin,
-            cpu_seconds=time.process_time() - cpu,
-            frames=told.frames,
-            rejected=mesh.rejections(),
-            flagged=doubtful,
-            faults=dict(exchange.counts) if isinstance(exchange, FaultyExchange) else {},
-        )
 
 
 if __name__ == "__main__":
