@@ -18,7 +18,7 @@ from duio_mesh.process import Report, main
 from duio_mesh.report.recording import Recording
 from duio_mesh.spec import RecorderSpec
 
-RATE_PERIOD = 0.5  # seconds between two values of the rates
+RATE_PERIOD = 0.5  # seconds between two values of the rates, and between writes that nobody watches
 
 
 class Rates:
@@ -57,7 +57,8 @@ def run(spec: RecorderSpec, report: Report) -> None:
         mesh.watch(lambda who, alive: changes.put((who, alive)))
         report("ready", url=recording.url)
         newest = {"plant": 0} | {f"node-{i}": 0 for i in spec.sizes}
-        rates, due = Rates(recording), time.monotonic() + PERIOD
+        pause = PERIOD if spec.live else RATE_PERIOD
+        rates, due = Rates(recording), time.monotonic() + pause
         while finishing.empty() or mesh.pending():
             with suppress(Empty):
                 if got := mesh.get(PERIOD):
@@ -70,7 +71,7 @@ def run(spec: RecorderSpec, report: Report) -> None:
             if time.monotonic() >= due:
                 rates.look(newest)
                 recording.flush()
-                due = time.monotonic() + PERIOD
+                due = time.monotonic() + pause
         recording.fill(
             map_rows(spec.truth, spec.n), {i: map_rows(path, spec.sizes[i]) for i, path in spec.estimates.items()}
         )

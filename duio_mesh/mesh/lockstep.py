@@ -10,10 +10,12 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import cache
 from math import isfinite
+from struct import Struct
 from types import TracebackType
-from typing import Self
+from typing import NamedTuple, Self
 from zlib import crc32
 
 import numpy as np
@@ -25,7 +27,31 @@ from duio_mesh.mesh.frames import FLOAT64, RESIDUE, TAIL, Decoder, Rejected, pre
 from duio_mesh.mesh.session import Mesh, Outlet, Ready, Source
 
 ROOM = 4  # frames per step of the window that may wait
+FEW = 48  # numbers
 TICK = 0.1  # seconds between the watchdog's looks
+
+
+class Form(NamedTuple):
+    """What a payload of ``size`` numbers looks like."""
+
+    size: int
+    rest: int  # bytes from the payload's first to the frame's last
+    finite: Callable[[bytes, int], bool]  # (frame, start): whether all numbers are; "no" may be wrong, see ``form``
+
+
+@cache
+def form(size: int) -> Form:
+    """The form of payloads of this size.
+
+    ``finite`` looks at one number only, the sum, or for many numbers the sum of 0 times each: whatever is not finite
+    shows in it. A sum that overflows sends a good frame the long way, where it is looked at number by number.
+    """
+    unpack, zeros = Struct(f"<{size}d").unpack_from, np.zeros(size)
+    if size <= FEW:  # a call into BLAS costs more than a few floats
+        return Form(size, 8 * size + TAIL, lambda data, start: isfinite(sum(unpack(data, start))))
+    return Form(
+        size, 8 * size + TAIL, lambda data, start: isfinite(zeros.dot(np.frombuffer(data, FLOAT64, size, start)))
+    )
 
 
 class Line(Source):
@@ -65,7 +91,6 @@ class Lockstep:
         self._at: tuple[Line, int, int] | None = None  # what the main thread waits for
         self._news, self._over = threading.Event(), False
         self._watchdog = threading.Thread(target=self._watch, name="watchdog", daemon=True)
-        self._zeros: dict[int, Array] = {}
 
     def __enter__(self) -> Self:
         self._watchdog.start()
@@ -82,10 +107,12 @@ class Lockstep:
         Raises RunError naming edge, step and round when it does not come before the deadline, or when the other side
         has gone.
         """
-        expected = line.prefix + stamp(k, r, 8 * size)
-        zeros = self._zeros.get(size)
-        if zeros is None:
-            zeros = self._zeros[size] = np.zeros(size)
+        return self.due(line, k, r, form(size), stamp(k, r, 8 * size))
+
+    def due(self, line: Line, k: int, r: int, form: Form, mark: bytes) -> Array:
+        """``take``, for a caller that asks many lines for the same thing; ``mark`` is its stamp on the wire."""
+        expected = line.prefix + mark
+        start, size = len(expected), form.size
         self._at = (line, k, r)
         while True:
             if line.waiting and (held := self._held(line, k, r, size)) is not None:
@@ -94,13 +121,15 @@ class Lockstep:
                 data: bytes = line.receive().payload.to_bytes()
             except zenoh.ZError:  # the watchdog has closed the channel, and it is empty
                 raise RunError(self._why(line, k, r)) from None
-            start = len(expected)
-            if data.startswith(expected) and len(data) == start + 8 * size + TAIL and crc32(data) == RESIDUE:
-                vector = np.frombuffer(data, FLOAT64, size, start)
-                if isfinite(zeros.dot(vector)):  # 0 times a number that is not finite is not a number
-                    line.last = (k, r)
-                    self._at = None
-                    return vector
+            if (
+                data.startswith(expected)
+                and len(data) == start + form.rest
+                and crc32(data) == RESIDUE
+                and form.finite(data, start)
+            ):
+                line.last = (k, r)
+                self._at = None
+                return np.frombuffer(data, FLOAT64, size, start)
             self.set_aside(line, data, k, r)
 
     def _held(self, line: Line, k: int, r: int, size: int) -> Array | None:
@@ -158,11 +187,11 @@ class Exchange:
     """One node's rounds with its neighbours."""
 
     def __init__(self, lockstep: Lockstep, told: Outlet, heard: Mapping[int, Line]) -> None:
-        self._take, self._send = lockstep.take, told.send
+        self._due, self._send = lockstep.due, told.send
         self._heard = sorted(heard.items())
 
     def __call__(self, k: int, r: int, vector: Array) -> dict[int, Array]:
         """Send our vector of step k, round r; every neighbour's vector of the same round, in ascending order of id."""
         self._send(k, r, vector)
-        take, size = self._take, vector.size
-        return {j: take(line, k, r, size) for j, line in self._heard}
+        due, wanted, mark = self._due, form(vector.size), stamp(k, r, 8 * vector.size)
+        return {j: due(line, k, r, wanted, mark) for j, line in self._heard}

@@ -26,20 +26,20 @@ class Observer:
     rounds = 1
 
     def __init__(self, spec: NodeSpec) -> None:
-        n, p, m = spec.n, spec.p, spec.m
+        n = spec.n
         N, L, M, E, G = (spec.matrices[name] for name in "NLMEG")
-        # one product per step: xi+ = step @ [xi; y; u; x-hat - x-hat_j for each neighbour j]
+        # one product per step: xi+ = step @ [xi; y; u; x-hat - x-hat_j for each neighbour j], and one for x-hat
         self._step = contiguous(np.hstack([N, L, M, *(-weight * G for weight in spec.hears.values())]))
-        self._data = np.zeros(self._step.shape[1])
-        self._xi, self._y, self._u, apart = np.split(self._data, [n, n + p, n + p + m])
-        self._apart = dict(zip(spec.hears, apart.reshape(-1, n), strict=True))
-        self._E, self._xhat, self._next = E, np.zeros(n), np.zeros(n)
+        self._look = contiguous(np.hstack([np.eye(n), -E]))
+        self._now, self._then = (_Page(spec, self._step.shape[1]) for _ in range(2))
+        self._xhat = np.zeros(n)
 
     def sample(self, y: Array, u: Array) -> None:
         """x-hat(k) = xi(k) - E y(k)  (17)."""
-        self._y[:], self._u[:] = y, u
-        np.dot(self._E, self._y, out=self._xhat)
-        np.subtract(self._xi, self._xhat, out=self._xhat)
+        now = self._now
+        now.y[:] = y
+        now.u[:] = u
+        np.dot(self._look, now.xi_y, out=self._xhat)
 
     def message(self, r: int) -> Array:
         """x-hat(k)."""
@@ -47,14 +47,29 @@ class Observer:
 
     def exchange(self, r: int, received: Mapping[int, Array]) -> None:
         """xi(k+1) from the neighbours' x-hat(k)  (16)."""
-        for j, apart in self._apart.items():
+        now, then = self._now, self._then
+        for j, apart in now.apart:
             if j in received:
                 np.subtract(self._xhat, received[j], out=apart)
             else:
                 apart.fill(0.0)
-        np.dot(self._step, self._data, out=self._next)
-        self._xi[:] = self._next
+        np.dot(self._step, now.data, out=then.xi)
+        self._now, self._then = then, now
 
     def estimate(self) -> Estimate:
         """x-hat(k)."""
         return Estimate(self._xhat.copy())
+
+
+class _Page:
+    """[xi; y; u; x-hat - x-hat_j, ...] of one step, and its parts.
+
+    Two take turns, because a product cannot overwrite its own factor.
+    """
+
+    def __init__(self, spec: NodeSpec, size: int) -> None:
+        n, p, m = spec.n, spec.p, spec.m
+        self.data = np.zeros(size)
+        self.xi, self.y, self.u, apart = np.split(self.data, [n, n + p, n + p + m])
+        self.xi_y = self.data[: n + p]
+        self.apart = tuple(zip(spec.hears, apart.reshape(-1, n), strict=True))
