@@ -32,6 +32,7 @@ def contenders(count: int, rounds: int, size: int) -> Contenders:
     ring = rings.admm_ring(count, max(1, rounds // ROUNDS), {"nu": ROUNDS + 1})
     found = {
         REFERENCE: partial(rivals.bare_zenoh, count, rounds, size),
+        "bare Zenoh, SCHED_BATCH": partial(rivals.bare_zenoh, count, rounds, size, True),
         "duio_mesh, admm": lambda: float(rings.run_mesh(ring)["rounds_per_second"]),
     }
     if count == 4:

@@ -82,10 +82,12 @@ def slowest(count: int, node: Callable[..., None], arguments: Callable[[int], tu
 # -- Zenoh -----------------------------------------------------------------------------------------------
 
 
-def zenoh_node(i: int, count: int, ports: list[int], rounds: int, size: int, results: Any) -> None:
+def zenoh_node(i: int, count: int, ports: list[int], rounds: int, size: int, batch: bool, results: Any) -> None:
     """tcp on loopback along the ring, one key per directed edge, BLOCK, a FIFO channel per neighbour."""
     import zenoh
 
+    if batch:
+        os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
     config, near = zenoh.Config(), neighbours(i, count)
     settings = {
         "mode": "peer",
@@ -118,15 +120,15 @@ def zenoh_node(i: int, count: int, ports: list[int], rounds: int, size: int, res
         del ready
 
 
-def bare_zenoh(count: int, rounds: int, size: int) -> float:
-    """Zenoh with the mesh's settings for links and threads, and nothing on top."""
+def bare_zenoh(count: int, rounds: int, size: int, batch: bool = False) -> float:
+    """Zenoh with the mesh's settings for links and threads, and nothing on top; ``batch``: scheduled like the mesh."""
     with ExitStack() as held:
         sockets = [held.enter_context(socket.socket()) for _ in range(count)]
         for s in sockets:
             s.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             s.bind(("127.0.0.1", 0))
         ports = [s.getsockname()[1] for s in sockets]
-        return slowest(count, zenoh_node, lambda i: (count, ports, rounds, size))
+        return slowest(count, zenoh_node, lambda i: (count, ports, rounds, size, batch))
 
 
 # -- ZeroMQ ----------------------------------------------------------------------------------------------
