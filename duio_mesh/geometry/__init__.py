@@ -12,7 +12,7 @@ from duio_mesh.geometry.invariant import (
     infimal_unobservability,
     unknown_input_structure,
 )
-from duio_mesh.geometry.stability import Stability, split_spectrum, stable_abscissa, stable_radius
+from duio_mesh.geometry.stability import Stability, spectral_radius, split_spectrum, stable_abscissa, stable_radius
 from duio_mesh.geometry.staircase import (
     Decomposition,
     detectability_decomposition,
@@ -65,6 +65,7 @@ __all__ = [
     "quotient",
     "rank",
     "reduced_observer",
+    "spectral_radius",
     "split_spectrum",
     "stabilise",
     "stable_abscissa",

@@ -94,3 +94,8 @@ def split_spectrum(A: Array, stability: Stability) -> tuple[Array, NDArray[np.co
     b = int(np.count_nonzero(bad))
     values = re + 1j * im
     return Z[:, :b], values[:b], values[b:]
+
+
+def spectral_radius(M: Array) -> float:
+    """The largest modulus of an eigenvalue of M (n, n); 0 when n is 0."""
+    return float(np.abs(np.linalg.eigvals(M)).max(initial=0.0))

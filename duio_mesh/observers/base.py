@@ -17,7 +17,7 @@ The vector returned by ``message`` may be a buffer that the next call overwrites
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, TypeGuard
 
 import numpy as np
 
@@ -70,7 +70,7 @@ class BatchObserver(Observer, Protocol):
         ...
 
 
-def can_batch(observer: type[Observer]) -> bool:
+def can_batch(observer: type[Observer]) -> TypeGuard[type[BatchObserver]]:
     """Whether this class of observers takes several steps at once."""
     return hasattr(observer, "batch")
 

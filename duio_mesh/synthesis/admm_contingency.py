@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from duio_mesh.arrays import Array
+from duio_mesh.geometry.stability import spectral_radius
 from duio_mesh.observers.fusion import fusion_rounds, step_size
 from duio_mesh.scenario.model import Graph
 from duio_mesh.synthesis.admm_options import Options
@@ -31,10 +31,10 @@ def error_radius(design: Design, graph: Graph) -> float:
         same = graph.ids == home and np.array_equal(degrees, left.degrees)
         return 0.0 if same else float("inf")
     if options.fusion == "relaxed":
-        return _radius(relaxed_matrix(left, options.c, degrees))
+        return spectral_radius(relaxed_matrix(left, options.c, degrees))
     inverse = left.inverse if options.normalised else None
     steps = [step_size(part, inverse, options.gamma, d) for part, d in zip(left.T, degrees, strict=True)]
-    return _radius(admm_matrix(left, options, options.alpha_factor * np.array(steps)))
+    return spectral_radius(admm_matrix(left, options, options.alpha_factor * np.array(steps)))
 
 
 def error_left(design: Design, graph: Graph) -> float:
@@ -45,7 +45,3 @@ def error_left(design: Design, graph: Graph) -> float:
     at = [designed.ids.index(i) for i in home]
     eigenvalues = spectrum(designed.laplacian()[np.ix_(at, at)])
     return error_radius(design, graph) ** fusion_rounds({**options.model_dump(), "eigenvalues": eigenvalues})
-
-
-def _radius(M: Array) -> float:
-    return float(np.abs(np.linalg.eigvals(M)).max(initial=0.0))

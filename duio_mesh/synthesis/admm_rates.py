@@ -11,6 +11,7 @@ from scipy import linalg
 
 from duio_mesh.arrays import Array
 from duio_mesh.geometry import complement
+from duio_mesh.geometry.stability import spectral_radius
 from duio_mesh.observers.fusion import fusion_rounds, step_size
 from duio_mesh.synthesis.admm_options import Options
 
@@ -134,8 +135,8 @@ def fusion_radius(island: Island, options: Options) -> float:
     if options.fusion == "finite_time":
         return 0.0
     if options.fusion == "relaxed":
-        return float(np.abs(np.linalg.eigvals(relaxed_matrix(island, options.c, island.degrees))).max())
-    return float(np.abs(np.linalg.eigvals(admm_matrix(island, options, island.step_sizes(options)))).max())
+        return spectral_radius(relaxed_matrix(island, options.c, island.degrees))
+    return spectral_radius(admm_matrix(island, options, island.step_sizes(options)))
 
 
 def relaxed_matrix(island: Island, c: float, degrees: Array) -> Array:

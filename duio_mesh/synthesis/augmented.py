@@ -14,6 +14,7 @@ import numpy as np
 from duio_mesh.arrays import Array
 from duio_mesh.errors import DesignError
 from duio_mesh.geometry import RTOL, Stability, detectability_decomposition, stable_radius
+from duio_mesh.geometry.stability import spectral_radius
 from duio_mesh.scenario.model import Graph, Scenario
 from duio_mesh.spec import NodeSpec
 from duio_mesh.synthesis.augmented_error import (
@@ -24,7 +25,6 @@ from duio_mesh.synthesis.augmented_error import (
     Transient,
     distance_to_instability,
     error_blocks,
-    spectral_radius,
     transient,
 )
 from duio_mesh.synthesis.augmented_existence import View, check

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from duio_mesh.arrays import Array
+from duio_mesh.geometry.stability import spectral_radius
 from duio_mesh.synthesis.sampled import Coupled
 
 
@@ -147,11 +148,6 @@ def _block(i: int, n: int, p: Sequence[int], beta: Sequence[int]) -> tuple[NDArr
     e, xi = np.arange(i * n, (i + 1) * n), np.arange(sum(beta[:i]), sum(beta[: i + 1]))
     innovation = np.arange(sum(p[:i]), sum(p[: i + 1]))
     return np.r_[e, n * N + xi], np.r_[innovation, all_p + e, all_p + n * N + xi]
-
-
-def spectral_radius(Phi: Array) -> float:
-    """The largest modulus of an eigenvalue; 0 for an empty matrix."""
-    return float(np.abs(np.linalg.eigvals(Phi)).max(initial=0.0))
 
 
 def gramians(Phi: Array, W: Array, Q: Array) -> tuple[Array, Array] | None:

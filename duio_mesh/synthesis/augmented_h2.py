@@ -18,7 +18,8 @@ from scipy import linalg
 from duio_mesh.arrays import Array
 from duio_mesh.errors import DesignError
 from duio_mesh.geometry import observability_decomposition
-from duio_mesh.synthesis.augmented_error import ErrorSystem, Gains, Network, gramians, spectral_radius
+from duio_mesh.geometry.stability import spectral_radius
+from duio_mesh.synthesis.augmented_error import ErrorSystem, Gains, Network, gramians
 from duio_mesh.synthesis.design import Progress
 from duio_mesh.synthesis.lbfgs import minimise
 

@@ -16,6 +16,7 @@ from scipy import linalg
 
 from duio_mesh.arrays import Array
 from duio_mesh.errors import DesignError
+from duio_mesh.geometry.stability import spectral_radius
 from duio_mesh.geometry.subspace import intersection, norm
 from duio_mesh.scenario.model import Graph, OpenLoop, Scenario, Signal
 from duio_mesh.spec import NodeSpec
@@ -30,7 +31,6 @@ from duio_mesh.synthesis.sampled import (
     error_system,
     largest_step,
     modes,
-    radius,
     sampled,
 )
 
@@ -84,7 +84,7 @@ def design(scenario: Scenario, progress: Progress) -> Design:
         exact = steps if at == h else {i: sampled(node.local, at, options) for i, node in nodes.items()}
         near = {i: _slope(scenario, options, i, at) for i in nodes}
         return max(
-            radius(error_system([node.coupled(chi, slope[i], exact[i]) for i, node in nodes.items()], L))
+            spectral_radius(error_system([node.coupled(chi, slope[i], exact[i]) for i, node in nodes.items()], L))
             for slope in (near, dict.fromkeys(nodes, 0.0))
         )
 
@@ -118,7 +118,7 @@ def error_radius(design: Design, graph: Graph) -> float:
             M, given = design.nodes[i].matrices, design.nodes[i].options
             slope = given["gamma"] / given["width"] if near and given["width"] else 0.0
             blocks.append(Coupled(M["Phi"], M["K"], (given["chi"] + slope) * M["R"], M["X"]))
-        radii.append(radius(error_system(blocks, graph.laplacian())))
+        radii.append(spectral_radius(error_system(blocks, graph.laplacian())))
     return max(radii)
 
 

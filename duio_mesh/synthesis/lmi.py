@@ -18,6 +18,7 @@ from duio_mesh.geometry import (
     observability_decomposition,
     stable_radius,
 )
+from duio_mesh.geometry.stability import spectral_radius
 from duio_mesh.scenario.model import Graph, Scenario
 from duio_mesh.scenario.strict import Strict
 from duio_mesh.spec import NodeSpec
@@ -25,7 +26,7 @@ from duio_mesh.synthesis.absence import Absence
 from duio_mesh.synthesis.design import Design, Progress, node_spec, plant_spec
 from duio_mesh.synthesis.lmi_coupling import couple_islands
 from duio_mesh.synthesis.lmi_network import Local, Network, certificate, error_matrix_of
-from duio_mesh.synthesis.local_gain import Subsystem, h2_gain, hinf_gain, placed_gain, radius, worst_gain
+from duio_mesh.synthesis.local_gain import Subsystem, h2_gain, hinf_gain, placed_gain, worst_gain
 from duio_mesh.synthesis.noise import noise_covariance
 from duio_mesh.synthesis.uio import decouple_node
 
@@ -81,7 +82,7 @@ def design(scenario: Scenario, progress: Progress) -> Design:
 
 def error_radius(design: Design, graph: Graph) -> float:
     """Spectral radius of (31) of graph.ids with the designed gains on another graph."""
-    return radius(error_matrix_of(design.nodes, graph))
+    return spectral_radius(error_matrix_of(design.nodes, graph))
 
 
 def _local(scenario: Scenario, i: int) -> Local:
@@ -119,7 +120,7 @@ def _local(scenario: Scenario, i: int) -> Local:
     if beta is None:
         beta = worst_gain(system, Kd)
     # (19) prints K_i = D_i' K_id; the dimensions and (20) need D_i
-    return Local(C, A, uio, parts, D @ Kd, beta, radius(system.A - Kd @ system.C), inert)
+    return Local(C, A, uio, parts, D @ Kd, beta, spectral_radius(system.A - Kd @ system.C), inert)
 
 
 def _spec(scenario: Scenario, i: int, network: Network) -> NodeSpec:

@@ -11,11 +11,11 @@ from scipy import linalg
 from duio_mesh.arrays import Array
 from duio_mesh.errors import DesignError
 from duio_mesh.geometry import RTOL, Decomposition
+from duio_mesh.geometry.stability import spectral_radius
 from duio_mesh.geometry.subspace import norm
 from duio_mesh.scenario.model import Graph, Scenario
 from duio_mesh.spec import NodeSpec
 from duio_mesh.synthesis.consensus import Coupling
-from duio_mesh.synthesis.local_gain import radius
 from duio_mesh.synthesis.losses import losses, without
 from duio_mesh.synthesis.noise import noise_covariance
 from duio_mesh.synthesis.sampled import Coupled, error_system
@@ -78,8 +78,8 @@ def certificate(scenario: Scenario, network: Network, Phi: Array, specs: Mapping
     Raises DesignError when a condition of the whole error system does not hold after all."""
     nodes, islands = network.nodes, network.islands.values()
     detectable = max(own.rho for own in nodes.values())
-    undetectable = max(radius(island.phi) for island in islands)
-    rho = radius(Phi)
+    undetectable = max(spectral_radius(island.phi) for island in islands)
+    rho = spectral_radius(Phi)
     conditions = _conditions(network, rho, scenario.options.consensus)
     if scenario.options.consensus == "robust":
         conditions |= _losses(scenario.graph, specs)
@@ -131,7 +131,7 @@ def _conditions(network: Network, rho: float, consensus: str) -> dict[str, dict[
 def _losses(graph: Graph, specs: Mapping[int, NodeSpec]) -> dict[str, dict[str, Any]]:
     """The largest eigenvalue of all graphs with one link lost, by the eigenvalues themselves."""
     radii = {
-        loss.words(graph): radius(error_matrix_of(specs, without(graph, loss)))
+        loss.words(graph): spectral_radius(error_matrix_of(specs, without(graph, loss)))
         for loss in losses(graph, 1)
         if loss.links
     }

@@ -17,6 +17,7 @@ from scipy import linalg
 from duio_mesh.arrays import Array
 from duio_mesh.errors import DesignError
 from duio_mesh.geometry import observability_decomposition
+from duio_mesh.geometry.stability import spectral_radius
 from duio_mesh.geometry.subspace import norm
 
 TOLERANCE = 1e-6
@@ -39,11 +40,6 @@ class Subsystem(NamedTuple):
         """
         size = norm(self.C)
         return 1e-4 * max(norm(self.F), 1 / size if size else 1.0)
-
-
-def radius(M: Array) -> float:
-    """The largest modulus of an eigenvalue; 0 for an empty matrix."""
-    return float(np.abs(np.linalg.eigvals(M)).max(initial=0.0))
 
 
 def worst_gain(system: Subsystem, K: Array) -> float:
@@ -72,7 +68,7 @@ def hinf_gain(system: Subsystem, node: str) -> tuple[Array, float]:
     in milliseconds and without the ill-conditioned P of (34). The accepted beta is confirmed by a frequency sweep; when
     it is not, rounding has misled the bisection, and every step of a second one is confirmed.
     """
-    if not system.F.any() and radius(system.A) < 1:
+    if not system.F.any() and spectral_radius(system.A) < 1:
         return np.zeros((len(system.A), len(system.C))), 0.0  # nothing to decouple, nothing to stabilise
     for confirmed in (False, True):
         K, beta = _bisection(system, node, confirmed)
@@ -131,7 +127,7 @@ def _central_gain(system: Subsystem, beta: float, confirmed: bool) -> Array | No
             K = np.linalg.solve(np.eye(len(C)) + C @ Y @ C.T, C @ Y @ A.T).T
             closed = A - K @ C
             balance = F @ F.T + system.stir**2 * I + K @ K.T + closed @ Y @ closed.T
-            if not (np.linalg.norm(balance - X) <= 1e-5 * np.linalg.norm(X) and radius(closed) < 1):
+            if not (np.linalg.norm(balance - X) <= 1e-5 * np.linalg.norm(X) and spectral_radius(closed) < 1):
                 return None
     except (np.linalg.LinAlgError, ValueError):  # singular, X >= beta^2 I somewhere, or no longer finite
         return None
@@ -159,7 +155,7 @@ def h2_gain(system: Subsystem, seen: Array, noise: Array, node: str) -> Array:
     except (linalg.LinAlgError, ValueError) as e:
         raise DesignError(f"{node}: the Riccati equation of the H2 gain has no stabilising solution ({e})") from None
     K: Array = np.linalg.solve(R + Cs @ X @ Cs.T, (A @ X @ Cs.T + S).T).T @ seen.T
-    if not radius(A - K @ C) < 1:
+    if not spectral_radius(A - K @ C) < 1:
         raise DesignError(f"{node}: the H2 gain does not stabilise its detectable part numerically")
     return K
 

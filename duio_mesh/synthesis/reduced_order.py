@@ -16,6 +16,7 @@ from scipy.sparse.csgraph import connected_components
 
 from duio_mesh.arrays import Array
 from duio_mesh.errors import DesignError
+from duio_mesh.geometry.stability import spectral_radius
 from duio_mesh.geometry.subspace import norm
 from duio_mesh.scenario.model import Graph, Scenario
 from duio_mesh.spec import NodeSpec
@@ -41,7 +42,6 @@ from duio_mesh.synthesis.sampled import (
     error_system,
     largest_step,
     modes,
-    radius,
     sampled,
 )
 
@@ -106,7 +106,7 @@ def design(scenario: Scenario, progress: Progress) -> Design:
 
     def rho(c: float, at: float = h) -> float:
         exact = steps if at == h else {i: sampled(node.local, at, options) for i, node in nodes.items()}
-        return radius(error_system([node.coupled(c, exact[i]) for i, node in nodes.items()], L))
+        return spectral_radius(error_system([node.coupled(c, exact[i]) for i, node in nodes.items()], L))
 
     c = choose_gain("c", options.c, growth, rho, h, L)
     certificate = {
@@ -129,7 +129,7 @@ def error_radius(design: Design, graph: Graph) -> float:
     for i in graph.ids:
         M = design.nodes[i].matrices
         blocks.append(Coupled(M["Phi"], M["K"], np.eye(n), M["Os"][:n]))
-    return radius(error_system(blocks, graph.laplacian()))
+    return spectral_radius(error_system(blocks, graph.laplacian()))
 
 
 def _unknown_input(scenario: Scenario) -> tuple[Array, list[str]]:

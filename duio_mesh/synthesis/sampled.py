@@ -103,11 +103,6 @@ def error_system(nodes: Sequence[Coupled], laplacian: Array) -> Array:
     return Phi
 
 
-def radius(M: Array) -> float:
-    """Spectral radius; 0 for an empty matrix."""
-    return float(np.abs(np.linalg.eigvals(M)).max(initial=0.0))
-
-
 def abscissa(M: Array) -> float:
     """Largest real part of an eigenvalue; -inf for an empty matrix."""
     return float(np.linalg.eigvals(M).real.max(initial=-np.inf))

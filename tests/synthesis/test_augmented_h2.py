@@ -10,7 +10,8 @@ from scipy import linalg, optimize
 
 from duio_mesh import load_scenario, synthesise
 from duio_mesh.errors import DesignError
-from duio_mesh.synthesis.augmented_error import ErrorSystem, Network, Sensor, spectral_radius
+from duio_mesh.geometry.stability import spectral_radius
+from duio_mesh.synthesis.augmented_error import ErrorSystem, Network, Sensor
 from duio_mesh.synthesis.augmented_h2 import Cost, h2_gains, mild_filter
 
 TOPOLOGIES = Path(__file__).parents[2] / "topologies"

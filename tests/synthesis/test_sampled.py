@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
 from duio_mesh import DesignError
+from duio_mesh.geometry.stability import spectral_radius
 from duio_mesh.observers.hold import History
 from duio_mesh.synthesis.sampled import (
     Coupled,
@@ -18,7 +19,6 @@ from duio_mesh.synthesis.sampled import (
     choose_gain,
     error_system,
     largest_step,
-    radius,
     sampled,
 )
 
@@ -70,7 +70,7 @@ def sampled_integrators(gain, h):
         local = Local(np.array([[a]]), np.zeros((1, 1)), np.zeros((1, 0)), np.eye(1), np.zeros(1))
         step = sampled(local, h, HoldOptions())
         nodes.append(Coupled(step.Phi, step.K, gain * np.eye(1), np.eye(1)))
-    return radius(error_system(nodes, np.array([[1.0, -1.0], [-1.0, 1.0]])))
+    return spectral_radius(error_system(nodes, np.array([[1.0, -1.0], [-1.0, 1.0]])))
 
 
 def test_error_system_by_hand():
