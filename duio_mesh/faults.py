@@ -10,11 +10,14 @@ from __future__ import annotations
 
 import hashlib
 import struct
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, TypeAlias
 
-ALWAYS = (0, 1 << 32)  # steps are unsigned 32-bit numbers on the wire
+Span: TypeAlias = tuple[int, int]
+"""From this step up to, not including, that step."""
+
+ALWAYS: Span = (0, 1 << 32)  # steps are unsigned 32-bit numbers on the wire
 COUNTED = ("lost", "corrupt", "late", "duplicate")  # what a receiver counts of its in-edges' frames
 MAX_DELAY = 1000  # steps or rounds
 
@@ -58,6 +61,7 @@ class NodeFault:
     what: Literal["kill", "pause", "restart"]
     step: int
     seconds: float = 0.0  # how long a pause lasts
+    away: int = 0  # steps that the others go on without a node that is restarted
 
 
 @dataclass(frozen=True)
@@ -67,6 +71,7 @@ class Incoming:
     target: int = 0
     seed: int = 0
     rules: Mapping[int, tuple[Rule, ...]] = field(default_factory=dict)  # by in-neighbour; only those with rules
+    absent: Mapping[int, tuple[Span, ...]] = field(default_factory=dict)  # by in-neighbour: steps without its process
 
 
 @dataclass(frozen=True)
@@ -77,9 +82,32 @@ class Faults:
     links: Mapping[tuple[int, int], tuple[Rule, ...]] = field(default_factory=dict)  # by (source, target)
     nodes: tuple[NodeFault, ...] = ()
 
-    def into(self, target: int) -> Incoming:
-        """The faults of the edges into this node."""
-        return Incoming(target, self.seed, {s: rules for (s, t), rules in sorted(self.links.items()) if t == target})
+    def into(self, target: int, hears: Collection[int] = ()) -> Incoming:
+        """The faults of the edges into this node, and when those of its in-neighbours ``hears`` are not there."""
+        rules = {s: rules for (s, t), rules in sorted(self.links.items()) if t == target}
+        absent = {j: self.absences(j) for j in sorted(hears) if self.absences(j)}
+        return Incoming(target, self.seed, rules, absent)
+
+    def absences(self, node: int) -> tuple[Span, ...]:
+        """The steps in which this node's process is not there, in order."""
+        spans = [
+            (fault.step, fault.step + fault.away if fault.what == "restart" else ALWAYS[1])
+            for fault in self.of(node)
+            if fault.what != "pause"
+        ]
+        return tuple(spans)
+
+    def of(self, node: int) -> tuple[NodeFault, ...]:
+        """What happens to this node, in order."""
+        return tuple(sorted((fault for fault in self.nodes if fault.node == node), key=lambda fault: fault.step))
+
+    def returns(self) -> Mapping[int, tuple[int, ...]]:
+        """The nodes that come back, by the step from which on they are there again, both ascending."""
+        found: dict[int, list[int]] = {}
+        for fault in sorted(self.nodes, key=lambda fault: (fault.step + fault.away, fault.node)):
+            if fault.what == "restart":
+                found.setdefault(fault.step + fault.away, []).append(fault.node)
+        return {k: tuple(ids) for k, ids in found.items()}
 
     def spoilt_by(self, source: int) -> Mapping[int, tuple[Rule, ...]]:
         """What a sender has to do itself on its out-edges: flip bits and send twice. All else the receiver decides."""
@@ -233,10 +261,17 @@ class Reception:
             j: Edge(incoming.seed, j, incoming.target, incoming.rules[j]) if j in incoming.rules else None
             for j in sorted(hears)
         }
+        self._absent = {j: incoming.absent.get(j, ()) for j in self._edges}
+        self.gone: set[int] = set()
+        """In-neighbours that are lost, without its having been planned; whoever notices adds and removes them."""
         self._tick = 0  # exchanges so far
         self._held: list[_Held] = []
         self.counts = dict.fromkeys(COUNTED, 0)
         """Frames so far, by what happened to them."""
+
+    def without(self, j: int, k: int) -> bool:
+        """Whether there is nobody at in-neighbour j's end in step k."""
+        return j in self.gone or any(first <= k < after for first, after in self._absent[j])
 
     def next(self, k: int, r: int) -> Arrivals:
         """What arrives in the exchange of step k, round r. To be asked once per exchange, in order.
@@ -245,6 +280,8 @@ class Reception:
         """
         on_time, held_back, lost = [], [], []
         for j, edge in self._edges.items():
+            if self.without(j, k):
+                continue
             fate = FINE if edge is None else edge.fate(k, r)
             self.counts["lost"] += fate.lost
             self.counts["corrupt"] += fate.corrupt

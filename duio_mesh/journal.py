@@ -27,11 +27,14 @@ class Journal:
     recorder that is slow, frozen or dead costs nothing.
     """
 
-    def __init__(self, path: str, size: int, outlet: Outlet) -> None:
+    def __init__(self, path: str, size: int, outlet: Outlet, first: int = 0) -> None:
+        """``first``: the step of the first row; earlier ones that the file does not hold become NaN."""
+        if path and first:
+            _fill(Path(path), size, first)
         self._file = Path(path).open("ab") if path else None  # noqa: SIM115  (closed in __exit__)
         self._outlet = outlet
         self._rows = np.empty((max(1, BATCH_BYTES // (8 * max(1, size))), size))
-        self._filled, self._first = 0, 0
+        self._filled, self._first = 0, first
         self._due = time.monotonic() + PERIOD
 
     def __enter__(self) -> Self:
@@ -71,6 +74,14 @@ class Journal:
         self._outlet.send(self._first, 0, rows)
         self._first += self._filled
         self._filled = 0
+
+
+def _fill(path: Path, size: int, rows: int) -> None:
+    """Make the journal of a lost process ``rows`` long."""
+    with path.open("ab") as f:
+        whole = f.tell() // (8 * size)
+        f.truncate(8 * size * whole)
+        f.write(np.full((rows - whole) * size, np.nan, dtype="<f8").tobytes())
 
 
 def aside(path: str | Path) -> Path:

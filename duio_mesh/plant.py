@@ -7,6 +7,7 @@ The truth goes to the plant's own file and to the recorder, never to a node.
 from __future__ import annotations
 
 import time
+from collections.abc import Callable, Mapping
 from queue import Empty
 
 import numpy as np
@@ -16,50 +17,91 @@ from duio_mesh.dynamics import Plant
 from duio_mesh.errors import RunError
 from duio_mesh.journal import Journal
 from duio_mesh.mesh import Mesh, Source
+from duio_mesh.mesh.lockstep import soon
+from duio_mesh.mesh.rejoin import ASK, admit
 from duio_mesh.process import Report, main
-from duio_mesh.spec import PlantSpec
+from duio_mesh.spec import PATIENCE, PlantSpec, blocks
 
 RECORDER = 3.0  # seconds to wait for a recorder, so that short runs can be seen from their beginning
 
 
 class Credits:
-    """How many steps each node has finished."""
+    """How many steps each node has finished, and who is not there."""
 
-    def __init__(self, mesh: Mesh, sources: list[Source], spec: PlantSpec) -> None:
-        self._mesh, self._spec = mesh, spec
+    def __init__(self, mesh: Mesh, sources: Mapping[int, Source], spec: PlantSpec, report: Report) -> None:
+        self._mesh, self._sources, self._spec, self._report = mesh, sources, spec, report
+        self._ids = {source: i for i, source in sources.items()}
         self._done = dict.fromkeys(sources, 0)
-
-    def slowest(self) -> int:
-        """Steps that every node has finished."""
-        return min(self._done.values())
+        self._asking: dict[int, int] = {}  # nodes that want to come back -> processes of each before
+        self.away: set[int] = set()
+        self._deadline = spec.deadline * (1 if spec.on_loss == "stop" else PATIENCE)
 
     def collect(self) -> None:
         """Take what has arrived, without waiting."""
         while self._mesh.pending():
-            self._take()
+            self._take(0.0)
 
     def wait(self, steps: int) -> None:
-        """Wait until every node has finished ``steps`` steps.
+        """Wait until every node that is there has finished ``steps`` steps.
 
         Raises RunError naming the nodes that do not move before the deadline, or that are lost.
         """
-        while self.slowest() < steps:
-            late = [s for s, done in self._done.items() if done < steps]
-            lost = [s.who for s in late if s.gone]
+        self._until(lambda: self._late(steps), steps)
+
+    def admit(self, k: int) -> dict[int, int]:
+        """Who comes back at step k -> processes of it before; those that are meant to are waited for."""
+        expected = self._spec.returns.get(k, ())
+        self._until(lambda: [i for i in expected if i not in self._asking], k)
+        back, self._asking = self._asking, {}
+        self._done |= dict.fromkeys(back, k)
+        self.away -= back.keys()
+        return back
+
+    def _late(self, steps: int) -> list[int]:
+        """The nodes to wait for."""
+        there = [i for i in self._done if i not in self.away]
+        if there:
+            return [i for i in there if self._done[i] < steps]
+        if self._spec.on_loss != "restart":
+            raise RunError(f"the plant has lost every node before step {steps}")
+        return [] if self._asking else list(self._done)
+
+    def _until(self, missing: Callable[[], list[int]], steps: int) -> None:
+        heard, said = time.monotonic(), False
+        while late := missing():
+            lost = [self._sources[i].who for i in late if self._sources[i].gone]
             if lost and not self._mesh.pending():
                 raise RunError(f"the plant lost {', '.join(lost)} before step {steps}")
             try:
-                self._take()
+                self._take(soon(self._spec.deadline))
+                heard = time.monotonic()
             except Empty:
-                who = ", ".join(f"{s.who} (at step {self._done[s]})" for s in late)
-                raise RunError(
-                    f"the plant waited {self._spec.deadline:g} s for {who} to finish step {steps - 1}"
-                ) from None
+                who = [self._sources[i].who for i in late]
+                if time.monotonic() - heard > self._deadline:
+                    words = ", ".join(f"node-{i} (at step {self._done[i]})" for i in late)
+                    raise RunError(
+                        f"the plant waited {self._deadline:g} s for {words} to finish step {steps - 1}"
+                    ) from None
+                if not said:
+                    said = True
+                    self._report("waiting", on=who, link="", k=steps - 1, r=0)
+        if said:
+            self._report("moving")
 
-    def _take(self) -> None:
-        if got := self._mesh.get(self._spec.deadline):
-            source, frame = got
-            self._done[source] = max(self._done[source], min(frame.k, self._spec.steps))
+    def _take(self, timeout: float) -> None:
+        got = self._mesh.get(timeout)
+        if got is None:  # somebody has gone
+            if self._spec.on_loss != "stop":
+                for i, source in self._sources.items():
+                    if source.gone:
+                        source.gone = False
+                        self.away.add(i)
+            return
+        i, frame = self._ids[got[0]], got[1]
+        if frame.r == ASK:
+            self._asking[i] = frame.k
+        else:
+            self._done[i] = max(self._done[i], min(frame.k, self._spec.steps))
 
 
 def run(spec: PlantSpec, report: Report) -> None:
@@ -67,7 +109,7 @@ def run(spec: PlantSpec, report: Report) -> None:
     plant = Plant(spec)
     with Mesh(spec.wire, "plant", report.warn) as mesh:
         keys, ids = mesh.keys, [s.id for s in spec.sensors]
-        nodes = [mesh.hear(keys.credit(i), f"{i} -> plant", f"node-{i}", ready=(i, "plant")) for i in ids]
+        nodes = {i: mesh.hear(keys.credit(i), f"{i} -> plant", f"node-{i}", ready=(i, "plant")) for i in ids}
         samples = {i: mesh.speak([(keys.plant(i), f"plant -> {i}", ("plant", i))]) for i in ids}
         mesh.watch()
         mesh.meet()
@@ -75,20 +117,22 @@ def run(spec: PlantSpec, report: Report) -> None:
         if spec.recorded and mesh.unanswered(RECORDER):  # it then reads what it missed from the journals
             report.warn(f"the recorder was not there after {RECORDER:g} s; starting without it")
         report("ready")
-        credits, begin, cpu = Credits(mesh, nodes, spec), time.monotonic(), time.process_time()
+        credits, begin, cpu = Credits(mesh, nodes, spec, report), time.monotonic(), time.process_time()
+        rows: dict[int, list[Array]] = {}
         with Journal(spec.output, plant.x.size, truth) as journal:
-            for k in range(0, spec.steps, spec.block):
-                block = range(k, min(k + spec.block, spec.steps))
+            for block in blocks(0, spec.steps, spec.block, spec.returns):
                 credits.collect()
                 credits.wait(block.stop - spec.window)
-                rows: dict[int, list[Array]] = {i: [] for i in ids}
+                if back := credits.admit(block.start):
+                    admit(samples, block.start, back, credits.away, {i: data[-1] for i, data in rows.items()})
+                rows = {i: [] for i in ids}
                 for _ in block:
                     for i, data in plant.sample().items():
                         rows[i].append(data)
                     journal.add((plant.x,))
                     plant.advance()
                 for i, outlet in samples.items():
-                    outlet.send(k, 0, np.array(rows[i]))
+                    outlet.send(block.start, 0, np.array(rows[i]))
             journal.flush()
             credits.wait(spec.steps)
         frames = sum(outlet.frames for outlet in samples.values())

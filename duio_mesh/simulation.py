@@ -11,8 +11,9 @@ from duio_mesh.arrays import Array
 from duio_mesh.dynamics import Plant
 from duio_mesh.faults import Reception, Stamp
 from duio_mesh.observers import make_observer
-from duio_mesh.observers.absence import Late, flagged, take_late
-from duio_mesh.observers.base import reader
+from duio_mesh.errors import RunError
+from duio_mesh.observers.absence import Late, flagged, neighbours_mean, part_with, start_again, take_late, welcome
+from duio_mesh.observers.base import NOTHING, reader
 from duio_mesh.observers.watch import watcher
 from duio_mesh.spec import NodeSpec
 from duio_mesh.synthesis.design import Design
@@ -20,43 +21,102 @@ from duio_mesh.trace import Trace as Trace  # re-exported: it lives lower, where
 
 
 def simulate(design: Design, progress: Callable[[int], None] = lambda _: None) -> Trace:
-    """Run plant and observers in lockstep; ``progress`` is called with the number of finished steps."""
+    """Run plant and observers in lockstep; ``progress`` is called with the number of finished steps.
+
+    Raises RunError at a step in which a node is killed on purpose and ``run.on_node_loss`` is stop.
+    """
     plant = Plant(design.plant)
-    observers = {i: make_observer(spec) for i, spec in design.nodes.items()}
-    network = {i: _InEdges(spec) for i, spec in design.nodes.items()}
-    truth, rows, marks = [], {i: list[Array]() for i in observers}, {i: list[bool]() for i in observers}
+    nodes = {i: _Node(spec) for i, spec in design.nodes.items()}
+    truth = list[Array]()
     steps, batch = design.plant.steps, design.scenario.run.batch
-    watched = {i: (watcher(observer), list[Array]()) for i, observer in observers.items()}
+    data = before = dict[int, Array]()
     for k in range(0, steps, batch):
         done = min(k + batch, steps)
+        _come_and_go(design, nodes, k, before)
+        present = {i: node for i, node in nodes.items() if node.present}
         for _ in range(k, done):
             data = plant.sample()
             truth.append(plant.x)
-            for i, observer in observers.items():
+            for i, node in present.items():
                 p = design.nodes[i].p
-                observer.sample(data[i][:p], data[i][p:])
+                node.observer.sample(data[i][:p], data[i][p:])
             plant.advance()
-        rounds = {i: o.rounds for i, o in observers.items()}  # islands may need different numbers of them
-        for r in range(max(rounds.values())):
-            turn = {i: o for i, o in observers.items() if r < rounds[i]}
-            sent = {i: o.message(r).copy() for i, o in turn.items()}
-            for i, observer in turn.items():
-                received, late = network[i].next(k, r, sent)
-                take_late(observer, late)
-                observer.exchange(r, received)
-        for i, observer in observers.items():
-            marks[i] += [flagged(observer)] * (done - k)
-            rows[i] += [np.concatenate(estimate) for estimate in reader(observer)()]
-            look, seen = watched[i]
-            seen.append(look())
+        before = data
+        rounds = {i: node.observer.rounds for i, node in present.items()}  # islands may need different numbers of them
+        for r in range(max(rounds.values(), default=0)):
+            turn = {i: node for i, node in present.items() if r < rounds[i]}
+            sent = {i: node.observer.message(r).copy() for i, node in turn.items()}
+            for node in turn.values():
+                received, late = node.network.next(k, r, sent)
+                take_late(node.observer, late)
+                node.observer.exchange(r, received)
+        for node in nodes.values():
+            node.write(done - k)
         progress(done)
     trace = split_trace(
         design,
         np.array(truth),
-        {i: np.array(r) for i, r in rows.items()},
-        {i: np.concatenate(seen) for i, (_, seen) in watched.items()},
+        {i: np.array(node.rows) for i, node in nodes.items()},
+        {i: np.concatenate(node.seen) for i, node in nodes.items()},
     )
-    return replace(trace, flagged=np.array([marks[int(i)] for i in trace.node_ids]))
+    return replace(trace, flagged=np.array([nodes[int(i)].marks for i in trace.node_ids]))
+
+
+class _Node:
+    """One node's observer, what reaches it, and what it has written."""
+
+    def __init__(self, spec: NodeSpec) -> None:
+        self.spec, self.present = spec, True
+        self.rows, self.marks, self.seen = list[Array](), list[bool](), list[Array]()
+        self._missing = np.full(sum(part.size for part in make_observer(spec).estimate()), np.nan)
+        self.begin(spec.steps)
+
+    def begin(self, steps: int) -> None:
+        """A new observer for the last ``steps`` steps, which knows nothing of earlier ones."""
+        self.network = _InEdges(self.spec)
+        self.observer = make_observer(replace(self.spec, steps=steps))
+        self._read, self._look = reader(self.observer), watcher(self.observer)
+
+    def write(self, steps: int) -> None:
+        """The rows of the steps that are done; of a node that is not there, NaN."""
+        if not self.present:
+            self.rows += [self._missing] * steps
+            self.marks += [False] * steps
+            return
+        self.marks += [flagged(self.observer)] * steps
+        self.rows += [np.concatenate(estimate) for estimate in self._read()]
+        self.seen.append(self._look())
+
+
+def _come_and_go(design: Design, nodes: dict[int, _Node], k: int, before: Mapping[int, Array]) -> None:
+    """Processes that are killed at the beginning of step k, and those that are back."""
+    faults = design.scenario.faults
+    back = faults.returns().get(k, ())
+    starts = {i: neighbours_mean(_told(nodes, i)) for i in back}  # before anybody of them is back
+    for i in back:
+        node, p = nodes[i], design.nodes[i].p
+        node.present = True
+        node.begin(design.plant.steps - k)
+        start_again(node.observer, starts[i] if node.spec.warm and before else None, before.get(i, NOTHING), p)
+        for j in node.spec.hears:
+            if not nodes[j].present and j not in back:
+                part_with(node.observer, j)
+        for j in node.spec.tells:
+            welcome(nodes[j].observer, i)
+    for fault in faults.nodes:
+        if fault.step != k or fault.what == "pause":  # a pause only takes time
+            continue
+        if design.scenario.run.on_node_loss == "stop":
+            raise RunError(f"node-{fault.node} was killed at step {k}, as faults.nodes asks; run.on_node_loss is stop")
+        nodes[fault.node].present = False
+        for j in nodes[fault.node].spec.tells:
+            part_with(nodes[j].observer, fault.node)
+
+
+def _told(nodes: Mapping[int, _Node], i: int) -> list[Array]:
+    """The newest estimates of x of those in-neighbours of node i that are there, in ascending order of id."""
+    there = [nodes[j] for j in sorted(nodes[i].spec.hears) if nodes[j].present and nodes[j].rows]
+    return [node.rows[-1][: nodes[i].spec.n] for node in there]
 
 
 class _InEdges:
@@ -64,7 +124,8 @@ class _InEdges:
 
     def __init__(self, spec: NodeSpec) -> None:
         self._hears = tuple(sorted(spec.hears))
-        self._reception = Reception(spec.faults, spec.hears) if spec.faults.rules else None
+        planned = spec.faults.rules or spec.faults.absent
+        self._reception = Reception(spec.faults, spec.hears) if planned else None
         self._held: dict[Stamp, Array] = {}
 
     def next(self, k: int, r: int, sent: Mapping[int, Array]) -> tuple[dict[int, Array], list[Late]]:

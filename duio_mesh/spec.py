@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
 
@@ -17,9 +17,10 @@ import msgpack
 import numpy as np
 
 from duio_mesh.arrays import Array, contiguous
-from duio_mesh.faults import UNDISTURBED, Incoming, Rule
+from duio_mesh.faults import UNDISTURBED, Incoming, NodeFault, Rule
 
 START = 30.0  # seconds for all processes of a run to find each other
+PATIENCE = 3  # deadlines: where a run goes on without lost nodes, the launcher settles first who is lost
 
 # the files in a process' folder of credentials
 USERS, PASSWORD = "users", "password"
@@ -76,6 +77,13 @@ class NodeSpec:
     faults: Incoming = UNDISTURBED  # on purpose, of its own in-edges
     spoils: Mapping[int, tuple[Rule, ...]] = dataclasses.field(default_factory=dict)  # of frames to out-neighbours
     without: str = ""  # what to do without a neighbour's message; "" where none can be missing
+    on_loss: str = "stop"  # when a neighbour is lost: stop | degrade | restart (it comes back)
+    warm: bool = True  # start from the neighbours' estimates when this process replaces a lost one
+    excuses: tuple[int, ...] = ()  # neighbours whose loss the certificate allows: the others' errors still go to zero
+    settling: int = 0  # steps in which errors shrink to a thousandth, by the certificate
+    acts: tuple[NodeFault, ...] = ()  # on purpose, to this very process
+    breaks: tuple[int, ...] = ()  # steps at which a block of samples ends early, because somebody comes back then
+    incarnation: int = 0  # how many processes of this node were there before this one
     output: str = ""  # file of this node's own estimates, float64 rows; "" keeps none
     wire: Wire = UNWIRED
 
@@ -108,6 +116,8 @@ class PlantSpec:
     window: int  # steps it may be ahead of the slowest node
     block: int  # steps whose samples travel in one frame
     deadline: float
+    on_loss: str = "stop"  # when a node is lost
+    returns: Mapping[int, tuple[int, ...]] = dataclasses.field(default_factory=dict)  # step: nodes to wait for there
     recorded: bool = False  # there is a recorder to wait for, a little
     output: str = ""  # file of the true state, float64 rows
     wire: Wire = UNWIRED
@@ -136,7 +146,7 @@ class RecorderSpec:
 Spec = TypeVar("Spec", NodeSpec, PlantSpec, RecorderSpec)
 
 _TYPES: dict[str, type[Any]] = {
-    t.__name__: t for t in (Guard, Wire, Rule, Incoming, NodeSpec, SensorSpec, PlantSpec, RecorderSpec)
+    t.__name__: t for t in (Guard, Wire, Rule, NodeFault, Incoming, NodeSpec, SensorSpec, PlantSpec, RecorderSpec)
 }
 _ARRAY, _RECORD = 1, 2  # msgpack extension codes
 
@@ -167,6 +177,16 @@ def _unpack(code: int, data: bytes) -> Any:
 
 def _load(data: bytes) -> Any:
     return msgpack.unpackb(data, ext_hook=_unpack, use_list=False, strict_map_key=False)
+
+
+def blocks(first: int, steps: int, block: int, breaks: Iterable[int] = ()) -> Iterator[range]:
+    """The steps from ``first`` up to ``steps``, cut at every multiple of ``block`` and at the steps ``breaks``."""
+    ends = sorted(breaks)
+    while first < steps:
+        ends = [k for k in ends if k > first]
+        end = min(first - first % block + block, steps, *ends[:1])
+        yield range(first, end)
+        first = end
 
 
 def write_spec(spec: NodeSpec | PlantSpec | RecorderSpec, path: Path) -> None:

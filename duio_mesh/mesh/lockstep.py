@@ -2,8 +2,9 @@
 
 The hot path of a node. Each incoming link has a channel that Zenoh fills without Python, so a round costs one wake-up
 per neighbour. A link delivers in order, so the next frame is nearly always the one that is due, and then comparing its
-first bytes with the expected ones replaces reading them. A wait has no timeout of its own: a watchdog closes the
-channel of a neighbour that has gone, or that let the deadline pass, and that ends the wait.
+first bytes with the expected ones replaces reading them. A wait has no timeout of its own: a watchdog knocks on the
+channel of a neighbour that has gone, or that let the deadline pass, and that ends the wait. A knock comes behind
+everything that the neighbour had sent.
 """
 
 from __future__ import annotations
@@ -23,12 +24,23 @@ import zenoh
 
 from duio_mesh.arrays import Array
 from duio_mesh.errors import RunError
-from duio_mesh.mesh.frames import FLOAT64, RESIDUE, TAIL, Decoder, Rejected, prefix, stamp
+from duio_mesh.mesh.frames import FLOAT64, RESIDUE, TAIL, Decoder, Frame, Rejected, prefix, stamp
 from duio_mesh.mesh.session import Mesh, Outlet, Ready, Source
 
 ROOM = 4  # frames per step of the window that may wait
 FEW = 48  # numbers
 TICK = 0.1  # seconds between the watchdog's looks
+SOON, PART = 1.0, 0.25  # a wait is worth a word after so many seconds, or this part of the deadline
+KNOCK = b""
+
+
+def soon(deadline: float) -> float:
+    """Seconds after which a wait is worth a word."""
+    return min(SOON, PART * deadline)
+
+
+class LinkLost(RunError):
+    """The other end of a link has gone."""
 
 
 class Form(NamedTuple):
@@ -69,25 +81,26 @@ class Line(Source):
         self.waiting: dict[tuple[int, int], Array] = {}  # good frames that are not due yet
         self.excused: dict[tuple[int, int], bool] = {}  # faults on purpose: frames past due, to be kept or dropped
         self.window, self.room = window, room or ROOM * window
-        self._subscriber = mesh.subscribe(key, zenoh.handlers.FifoChannel(self.room), ready)
-        self._closed = False
-        self.receive = self._subscriber.handler.recv
-        self.poll = self._subscriber.handler.try_recv
+        self.late: object = None  # the wait in which it let the deadline pass
+        handler = mesh.subscribe(key, zenoh.handlers.FifoChannel(self.room), ready).handler
+        self.receive, self.poll = handler.recv, handler.try_recv
+        self._mesh, self._key = mesh, key
         mesh.sources.append(self)
 
-    def close(self) -> None:
-        """End the wait of ``receive``, once it has returned everything that had come."""
-        if not self._closed:
-            self._closed = True
-            self._subscriber.undeclare()
+    def knock(self) -> None:
+        """Let ``receive`` return ``KNOCK``, after everything that has come."""
+        self._mesh.tell_self(self._key, KNOCK)
 
 
 class Lockstep:
     """Takes frames in order; a context manager around the time in which it may wait."""
 
-    def __init__(self, mesh: Mesh, deadline: float) -> None:
-        """``deadline``: seconds that any one wait may last."""
-        self._mesh, self._deadline = mesh, deadline
+    def __init__(self, mesh: Mesh, deadline: float, say: Callable[..., None] = lambda *_, **__: None) -> None:
+        """``deadline``: seconds that any one wait may last.
+
+        ``say`` is called as say("waiting", on=, link=, k=, r=) when one lasts long, say("moving") when that is over.
+        """
+        self._mesh, self._deadline, self._say = mesh, deadline, say
         self._at: tuple[Line, int, int] | None = None  # what the main thread waits for
         self._news, self._over = threading.Event(), False
         self._watchdog = threading.Thread(target=self._watch, name="watchdog", daemon=True)
@@ -117,10 +130,7 @@ class Lockstep:
         while True:
             if line.waiting and (held := self._held(line, k, r, size)) is not None:
                 return held
-            try:
-                data: bytes = line.receive().payload.to_bytes()
-            except zenoh.ZError:  # the watchdog has closed the channel, and it is empty
-                raise RunError(self._why(line, k, r)) from None
+            data: bytes = line.receive().payload.to_bytes()
             if (
                 data.startswith(expected)
                 and len(data) == start + form.rest
@@ -130,7 +140,37 @@ class Lockstep:
                 line.last = (k, r)
                 self._at = None
                 return np.frombuffer(data, FLOAT64, size, start)
-            self.set_aside(line, data, k, r)
+            if data == KNOCK:
+                self._answer(line, k, r)
+            else:
+                self.set_aside(line, data, k, r)
+
+    def next_of(self, line: Line, r: int) -> Frame:
+        """The next frame of round r from this line, of whatever step and size; others are dropped. Raises as ``take``.
+
+        For a process that does not know yet which step it is.
+        """
+        self._at = (line, 0, r)
+        while True:
+            data: bytes = line.receive().payload.to_bytes()
+            if data == KNOCK:
+                self._answer(line, 0, r)
+                continue
+            try:
+                frame = line.decode(data)
+            except Rejected as e:
+                self._mesh.reject(line, e.cause)
+                continue
+            if frame.r == r:
+                line.last = frame[:2]
+                self._at = None
+                return frame
+
+    def _answer(self, line: Line, k: int, r: int) -> None:
+        """A knock: of this wait, or of one that has ended well meanwhile."""
+        if line.gone or line.late is self._at:
+            self._at = None
+            raise (LinkLost if line.gone else RunError)(self._why(line, k, r))
 
     def _held(self, line: Line, k: int, r: int, size: int) -> Array | None:
         """The frame of step k, round r, if it came before it was due and has the right size."""
@@ -171,16 +211,26 @@ class Lockstep:
             self._news.set()
 
     def _watch(self) -> None:
-        """End a wait that cannot end well."""
-        seen, since = None, time.monotonic()
+        """Say which waits last long, and end those that cannot end well."""
+        seen, since, told = None, time.monotonic(), False
         while not self._over:
             self._news.wait(TICK)
             self._news.clear()
             at, now = self._at, time.monotonic()
             if at is not seen:
-                seen, since = at, now
-            if at and (at[0].gone or now - since > self._deadline):
-                at[0].close()
+                if told:
+                    self._say("moving")
+                seen, since, told = at, now, False
+            if not at:
+                continue
+            line, k, r = at
+            if now - since > soon(self._deadline) and not told:
+                told = True
+                self._say("waiting", on=[line.who], link=line.name, k=k, r=r)
+            if now - since > self._deadline:
+                line.late = at
+            if line.gone or line.late is at:
+                line.knock()
 
 
 class Exchange:

@@ -104,6 +104,11 @@ class Outlet:
             publisher.put(frame)
         self.frames += len(self._publishers)
 
+    def send_to(self, at: int, k: int, r: int, vector: Array) -> None:
+        """As ``send``, on key number ``at`` only."""
+        self._publishers[at].put(self._encode(k, r, vector))
+        self.frames += 1
+
     def send_each(self, k: int, r: int, vector: Array, spoil: Callable[[int, bytes], Iterable[bytes]]) -> None:
         """As ``send``, but key number ``at`` carries what ``spoil(at, frame)`` makes of the frame."""
         frame = self._encode(k, r, vector)
@@ -125,6 +130,8 @@ class Mesh:
         self._warn = warn
         self._queue: SimpleQueue[tuple[Source | str, bytes | None]] = SimpleQueue()
         self.sources: list[Source] = []
+        self._seen = threading.Condition()
+        self._births, self._deaths = Counter[str](), Counter[str]()  # of processes with a direct link, as announced
         self._meeting: dict[str, Any] = {}  # name of a link -> publisher that must match before the start
         self._kept: list[Any] = []
         try:
@@ -138,7 +145,11 @@ class Mesh:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
-        """Close the session, which sends what is still queued: always, or the interpreter might never exit.
+        """``close``: always, or the interpreter might never exit."""
+        self.close()
+
+    def close(self) -> None:
+        """End the session, which sends what is still queued.
 
         A frozen peer would hold that up for ever; after ``CLOSE`` seconds we leave without it.
         """
@@ -168,6 +179,10 @@ class Mesh:
             self._kept.append(self._session.declare_subscriber(self.keys.ready(*ready), zenoh.handlers.FifoChannel(1)))
         return subscriber
 
+    def tell_self(self, key: str, data: bytes) -> None:
+        """Put a message into our own subscriber's channel; it does not leave this process."""
+        self._session.put(key, data, allowed_destination=zenoh.Locality.SESSION_LOCAL)
+
     def speak(self, links: Iterable[tuple[str, str, Ready | None]], drop: bool = False) -> Outlet:
         """Publish on every (key, name, ready) of ``links``; with ``drop`` a slow receiver costs frames, not time."""
         publishers = []
@@ -188,6 +203,9 @@ class Mesh:
 
         def seen(sample: Any) -> None:
             who, alive = str(sample.key_expr)[start:], sample.kind == zenoh.SampleKind.PUT
+            with self._seen:
+                (self._births if alive else self._deaths)[who] += 1
+                self._seen.notify_all()
             if changed:
                 changed(who, alive)
             if not alive:
@@ -195,6 +213,19 @@ class Mesh:
 
         everyone = self.keys.alive("*")
         self._kept.append(self._session.liveliness().declare_subscriber(everyone, _at_once(seen), history=True))
+
+    def alive(self, who: str) -> bool:
+        """Whether a directly linked process has announced itself and not gone since."""
+        return self._births[who] > self._deaths[who]
+
+    def await_birth(self, who: str, number: int, timeout: float) -> bool:
+        """Wait for the ``number``-th process of this name (those before it may have gone unseen); is it there?
+
+        A process announces itself after it has declared what it hears: from then on what we send reaches it.
+        """
+        with self._seen:
+            self._seen.wait_for(lambda: self._births[who] >= number, timeout)
+            return self.alive(who)
 
     # -- the start barrier ------------------------------------------------------------------------------------------
 

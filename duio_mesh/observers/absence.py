@@ -45,6 +45,40 @@ def flagged(observer: Observer) -> bool:
     return bool(getattr(observer, "flagged", False))
 
 
+def neighbours_mean(told: Sequence[Array]) -> Array | None:
+    """Where a node that comes back starts: the mean of its neighbours' estimates (n,); None when nobody tells any."""
+    return sum(told[1:], told[0]) / len(told) if told else None
+
+
+def start_again(observer: Observer, x: Array | None, data: Array, p: int) -> None:
+    """Begin after a step with x-hat = ``x`` and own data [y; u], y of ``p`` numbers; without an x from nothing."""
+    if x is None:
+        distrust(observer)
+    else:
+        observer.resume(x, data[:p], data[p:])
+
+
+def part_with(observer: Observer, j: int) -> None:
+    """Tell the observer that neighbour j's process is gone: nothing will come until ``welcome``."""
+    parted: Callable[[int], None] | None = getattr(observer, "part_with", None)
+    if parted is not None:
+        parted(j)
+
+
+def welcome(observer: Observer, j: int) -> None:
+    """Tell the observer that neighbour j is there again, from the coming exchange on."""
+    back: Callable[[int], None] | None = getattr(observer, "welcome", None)
+    if back is not None:
+        back(j)
+
+
+def distrust(observer: Observer) -> None:
+    """Tell the observer that it begins late and from nothing: its first estimates are not worth much."""
+    unsettled: Callable[[], None] | None = getattr(observer, "distrust", None)
+    if unsettled is not None:
+        unsettled()
+
+
 class Silence:
     """How badly a node's neighbours are missed: one leaky account each.
 
@@ -57,10 +91,10 @@ class Silence:
     def __init__(self, ids: Iterable[int]) -> None:
         self._level = dict.fromkeys(ids, 0)
 
-    def note(self, heard: Container[int]) -> float:
-        """After an exchange: the doubt about the worst neighbour."""
+    def note(self, heard: Container[int], excused: Container[int] = ()) -> float:
+        """After an exchange: the doubt about the worst neighbour; who is excused counts as heard."""
         for j, level in self._level.items():
-            self._level[j] = max(0, level - 1) if j in heard else level + MISS
+            self._level[j] = max(0, level - 1) if j in heard or j in excused else level + MISS
         return float(max(0, max(self._level.values(), default=0) - MISS * PATIENCE))
 
 
@@ -70,7 +104,9 @@ class _Guard:
     def __init__(self, inner: Observer, spec: NodeSpec) -> None:
         self._inner, self._hears = inner, tuple(sorted(spec.hears))
         self._policy = spec.without
-        self._doubt = 0.0  # what the next message says
+        self._excuses, self._excused, self._parted = spec.excuses, set[int](), set[int]()
+        self._doubt = 0.0  # about what the neighbours have said
+        self._settling, self._unsettled = spec.settling, 0  # steps that a late beginning takes, and that are left of it
         self._late: list[Late] = []
 
     @property
@@ -80,7 +116,12 @@ class _Guard:
 
     def message(self, r: int) -> Array:
         """The method's vector, then the doubt."""
-        return np.append(self._inner.message(r), self._doubt)
+        return np.append(self._inner.message(r), max(self._doubt, float(self._unsettled)))
+
+    @property
+    def flagged(self) -> bool:
+        """Is the newest estimate marked?"""
+        return self._doubt > 0 or self._unsettled > 0
 
     def watched(self) -> Array:
         """What the method has kept of its rounds."""
@@ -89,6 +130,27 @@ class _Guard:
     def late(self, arrived: Sequence[Late]) -> None:
         """Vectors of earlier exchanges that arrive in the coming one."""
         self._late.extend(arrived)
+
+    def part_with(self, j: int) -> None:
+        """Neighbour j is gone. When the design allows for that, its silence is no reason to doubt.
+
+        Two at once are more than ``spec.excuses`` speaks of: then nobody is excused.
+        """
+        self._parted.add(j)
+        self._excused = self._parted & set(self._excuses) if len(self._parted) == 1 else set()
+
+    def welcome(self, j: int) -> None:
+        """Neighbour j is back."""
+        self._parted.discard(j)
+        self._excused = self._parted & set(self._excuses) if len(self._parted) == 1 else set()
+
+    def distrust(self) -> None:
+        """This node begins late and from nothing: its errors need ``spec.settling`` steps."""
+        self._unsettled = self._settling
+
+    def resume(self, x: Array, y: Array, u: Array) -> None:
+        """As the method does."""
+        self._inner.resume(x, y, u)
 
     def estimate(self) -> Estimate:
         """As the method has."""
@@ -114,13 +176,9 @@ class Coupled(_Guard):
         self._last: dict[int, tuple[int, Array]] = {}  # for hold: the newest vector and its age
         self._said: deque[Array] = deque(maxlen=MEMORY)  # own vectors, newest first
 
-    @property
-    def flagged(self) -> bool:
-        """Is the newest estimate marked?"""
-        return self._doubt > 0
-
     def sample(self, y: Array, u: Array) -> None:
         """As the method does."""
+        self._unsettled = max(0, self._unsettled - 1)
         self._inner.sample(y, u)
 
     def exchange(self, r: int, received: Mapping[int, Array]) -> None:
@@ -133,7 +191,7 @@ class Coupled(_Guard):
         timely = {late.source for late in self._late if self._policy == "pair" and late.steps <= self._paired}
         self._late.clear()
         stale = self._policy == "hold" and len(usable) > len(vectors)
-        silent = self._silence.note(vectors.keys() | timely)
+        silent = self._silence.note(vectors.keys() | timely, self._excused)
         self._doubt = max(silent, told - 1, self._doubt - 1, HELD if stale else 0.0, 0.0)
         self._inner.exchange(r, usable)
 
@@ -146,7 +204,7 @@ class Coupled(_Guard):
                 if j not in self._last or steps < self._last[j][0]:
                     self._last[j] = (steps, vector[:-1])
             self._last |= {j: (0, vector) for j, vector in heard.items()}
-            found = {j: vector for j, (_, vector) in self._last.items()}
+            found = {j: vector for j, (_, vector) in self._last.items() if j not in self._parted}
         elif self._policy == "pair":
             for j, steps, _, vector in self._late:  # oldest first: the newest stays
                 if j not in heard and steps < len(self._said):
@@ -182,11 +240,6 @@ class Fused(_Guard):
             self._AB = np.hstack([spec.matrices["A"], spec.matrices["B"]])
         self._x = np.zeros(spec.n)
 
-    @property
-    def flagged(self) -> bool:
-        """Are the newest estimates marked?"""
-        return self._doubt > 0
-
     def sample(self, y: Array, u: Array) -> None:
         """As the method does; the first sample after an estimate begins a step without doubt."""
         if self._results:
@@ -195,6 +248,7 @@ class Fused(_Guard):
             self._results, self._inputs, self._newest, self._doubt, self._set_up = [], [], {}, 0.0, 0
             self._silence = Silence(self._hears)
         self._inputs.append(u.copy())
+        self._unsettled = max(0, self._unsettled - 1)
         self._inner.sample(y, u)
 
     def exchange(self, r: int, received: Mapping[int, Array]) -> None:
@@ -217,8 +271,13 @@ class Fused(_Guard):
 
     def _doubted(self, heard: Mapping[int, Array], told: float) -> float:
         if self._exact:
-            return float(self._doubt or told or len(heard) < len(self._hears))
-        return max(self._silence.note(heard), told - 1, self._doubt - 1, 0.0)
+            return float(self._doubt or told or any(j not in heard and j not in self._excused for j in self._hears))
+        return max(self._silence.note(heard, self._excused), told - 1, self._doubt - 1, 0.0)
+
+    def resume(self, x: Array, y: Array, u: Array) -> None:
+        """As the method does; x-hat and the inputs of the step before are what ``predict`` goes on from."""
+        self._inner.resume(x, y, u)
+        self._x, self._before = x.copy(), u.copy()
 
     def estimate(self) -> Estimate:
         """Of the newest sample."""

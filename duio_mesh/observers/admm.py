@@ -100,6 +100,12 @@ class Observer:
         if r + 1 == self._ahead:
             self._finish_setup()
 
+    def resume(self, x: Array, y: Array, u: Array) -> None:
+        """s_i(k+1) by (5) from s_i(k) = P_i x-hat(k)."""
+        self._s[:] = self._T[: self._s.size] @ x
+        self._y[:], self._u[:] = y, u
+        np.dot(self._local, self._own, out=self._next)
+
     def estimate(self) -> Estimate:
         """x_i of the newest sample, after the last round."""
         return self.batch()[-1] if self._fusion else Estimate(self._xhat)

@@ -64,6 +64,12 @@ class Observer:
         np.dot(self._coupling, self._s, out=self._pull)
         np.add(self._next, self._pull, out=self._state)
 
+    def resume(self, x: Array, y: Array, u: Array) -> None:
+        """z from x-hat, then a step without neighbours; xi starts at zero."""
+        self._z[:] = x - self._H @ y
+        self.sample(y, u)
+        self.exchange(0, {})
+
     def estimate(self) -> Estimate:
         """x-hat(k)."""
         return Estimate(self._xhat)

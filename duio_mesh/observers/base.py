@@ -54,6 +54,13 @@ class Observer(Protocol):
         """Use the neighbours' vectors of round r, in ascending order of id."""
         ...
 
+    def resume(self, x: Array, y: Array, u: Array) -> None:
+        """Begin, instead of at zero, after a step of which others have the estimate x (n,), and y, u are the own data.
+
+        Called at most once, before the first ``sample``, which is then of the next step.
+        """
+        ...
+
     def estimate(self) -> Estimate:
         """The estimate of x(k), valid once the step's exchanges are done; zeros of the right sizes before step 0."""
         ...

@@ -33,7 +33,7 @@ class Observer:
         self._M, self._hears = M, spec.hears
         self._chi, self._gamma, self._width = (spec.options[name] for name in ("chi", "gamma", "width"))
         self._history = History(size, M["Gamma"].shape[1] // size)
-        self._z = np.zeros(M["Phi"].shape[0])
+        self._z: Array = np.zeros(M["Phi"].shape[0])
         self._push = np.zeros(M["R"].shape[0])
         self._x = np.zeros(spec.n)
 
@@ -57,6 +57,12 @@ class Observer:
         self._push = self._chi * a
         if self._gamma:
             self._push += self._gamma * (np.clip(a / self._width, -1.0, 1.0) if self._width else np.sign(a))
+
+    def resume(self, x: Array, y: Array, u: Array) -> None:
+        """The z whose estimate comes nearest to x at this tick; no coupling until the next."""
+        z = np.linalg.lstsq(self._M["X"], x - self._M["F"] @ y, rcond=None)[0]
+        self._z = z.astype(np.float64, copy=False)
+        self.sample(y, u)
 
     def estimate(self) -> Estimate:
         """x-hat(k)."""

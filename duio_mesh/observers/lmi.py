@@ -56,6 +56,15 @@ class Observer:
         np.dot(self._step, now.data, out=then.xi)
         self._now, self._then = then, now
 
+    def resume(self, x: Array, y: Array, u: Array) -> None:
+        """xi from x-hat by (17), then a step without neighbours."""
+        now = self._now
+        now.xi[:] = 0.0
+        now.y[:] = y
+        now.xi[:] = x - self._look @ now.xi_y
+        self.sample(y, u)
+        self.exchange(0, {})
+
     def estimate(self) -> Estimate:
         """x-hat(k)."""
         return Estimate(self._xhat.copy())

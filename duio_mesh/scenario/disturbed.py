@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from duio_mesh.faults import ALWAYS, Faults, NodeFault, Rule
@@ -11,14 +11,18 @@ from duio_mesh.scenario.problems import Path, Problems, listed
 from duio_mesh.scenario.validate import whole
 
 Arc = tuple[int, int]
+AWAY = 10  # steps (blocks of run.batch) that a restarted node is away when the file does not say
 
 
-def read_faults(written: Any, graph: model.Graph | None, seed: int, problems: Problems) -> Faults:
-    """The faults; ``seed`` is the run's, for when they have none of their own.
+def read_faults(
+    written: Any, graph: model.Graph | None, run: Mapping[str, Any], problems: Problems
+) -> Faults:
+    """The faults, by the ``run``'s settings: its seed, for when they have none of their own, and what a lost node means.
 
     Rules are numbered in the order of the file, links before cuts: the number is part of the key of a rule's draws.
     """
     path: Path = ("faults",)
+    seed = run.get("seed", 0)
     if written is None:
         return Faults(seed)
     faults = whole(schema.Faults, written, path, problems)
@@ -31,7 +35,8 @@ def read_faults(written: Any, graph: model.Graph | None, seed: int, problems: Pr
         rule = _rule(number, entry, (*path, key, k), problems)
         for arc in _arcs(entry, (*path, key, k), graph, problems):
             rules.setdefault(arc, []).append(rule)
-    nodes = [_node(fault, (*path, "nodes", k), graph, problems) for k, fault in enumerate(faults.nodes)]
+    nodes = [_node(fault, (*path, "nodes", k), graph, run, problems) for k, fault in enumerate(faults.nodes)]
+    _check_order(nodes, (*path, "nodes"), problems)
     links = {arc: tuple(several) for arc, several in sorted(rules.items())}
     return Faults(seed if faults.seed is None else faults.seed, links, tuple(nodes))
 
@@ -81,11 +86,43 @@ def _arcs(entry: schema.Affected, path: Path, graph: model.Graph | None, problem
     return found
 
 
-def _node(fault: schema.NodeFault, path: Path, graph: model.Graph | None, problems: Problems) -> NodeFault:
+def _node(
+    fault: schema.NodeFault, path: Path, graph: model.Graph | None, run: Mapping[str, Any], problems: Problems
+) -> NodeFault:
     if graph is not None and graph.ids and fault.node not in graph.ids:
         problems.at((*path, "node"), f"no such node: {fault.node}; the nodes are {listed(graph.ids, 'and')}")
+    policy, batch = run.get("on_node_loss", "stop"), run.get("batch", 1)
     if fault.kill is not None:
+        if policy == "restart":
+            problems.at(
+                (*path, "kill"),
+                "under run.on_node_loss: restart say when the node is back, so that the run can be repeated: "
+                "{node, restart: step, away: steps}",
+            )
+        _check_block(fault.kill, (*path, "kill"), batch, problems)
         return NodeFault(fault.node, "kill", fault.kill)
     if fault.restart is not None:
-        return NodeFault(fault.node, "restart", fault.restart)
+        if policy != "restart":
+            problems.at((*path, "restart"), f"needs run.on_node_loss: restart (it is {policy})")
+        away = AWAY * batch if fault.away is None else fault.away
+        _check_block(fault.restart, (*path, "restart"), batch, problems)
+        _check_block(away, (*path, "away"), batch, problems)
+        return NodeFault(fault.node, "restart", fault.restart, away=away)
     return NodeFault(fault.node, "pause", fault.pause or 0, fault.seconds or 0.0)
+
+
+def _check_block(step: int, path: Path, batch: int, problems: Problems) -> None:
+    if step % batch:
+        problems.at(path, f"should be a multiple of run.batch = {batch}: a node comes and goes between two blocks")
+
+
+def _check_order(nodes: Sequence[NodeFault], path: Path, problems: Problems) -> None:
+    """Nothing happens to a process while it is not there."""
+    for k, fault in enumerate(nodes):
+        others = Faults(nodes=tuple(other for other in nodes if other is not fault)).absences(fault.node)
+        for first, after in others:
+            if first <= fault.step < after:
+                until = "for good" if after == ALWAYS[1] else f"until step {after}"
+                problems.at(
+                    (*path, k, fault.what), f"node {fault.node} is not there: it is gone from step {first} {until}"
+                )

@@ -67,7 +67,7 @@ def _scenario(document: dict[str, Any], problems: Problems, options_of: OptionsO
     graph = read_graph(document["graph"], nodes, problems) if "graph" in document else None
     method, options = _observer(document["observer"], problems, options_of) if "observer" in document else ("", None)
     settings = _run(run, len(nodes or ()) * (parts.states.number if parts.states else 0), problems)
-    faults = read_faults(document.get("faults"), graph, run.get("seed", 0), problems)
+    faults = read_faults(document.get("faults"), graph, run, problems)
     security = _security(document, problems)
     if problems or parts.plant is None or nodes is None or graph is None or settings is None:
         return None
@@ -140,4 +140,5 @@ def _run(run: dict[str, Any], numbers: int, problems: Problems) -> model.Run | N
     if not schema.Run.model_fields.keys() <= run.keys():
         return None
     verdict = model.Convergence(**run["convergence"].model_dump())
-    return model.Run(run["steps"], run["seed"], verdict, run["deadline"], run["window"], run["batch"])
+    settings = {key: run[key] for key in model.Run.__dataclass_fields__ if key != "convergence"}
+    return model.Run(convergence=verdict, **settings)

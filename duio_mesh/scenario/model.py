@@ -152,6 +152,9 @@ class Run:
     deadline: float  # seconds a process waits for a message before the run fails
     window: int  # steps that the plant may be ahead of the slowest node
     batch: int = 1  # steps whose fusion travels as one block; estimates then come that many steps late
+    on_node_loss: Literal["stop", "degrade", "restart"] = "stop"
+    rejoin: Literal["warm", "cold"] = "warm"  # how a node that was replaced starts
+    max_seconds: float | None = None  # wall clock, from the start of the processes
 
 
 class Security(NamedTuple):
@@ -180,6 +183,11 @@ class Scenario:
     document: Mapping[str, Any] = field(repr=False)  # the resolved file as plain data: what scenario.yaml is made of
     faults: Faults = NO_FAULTS
     security: Security = OPEN
+
+    @property
+    def patchy(self) -> bool:
+        """Whether messages can be missing, so that observers need to know what to do without them."""
+        return bool(self.faults.links) or self.run.on_node_loss != "stop"
 
     def known(self, i: int) -> Array:
         """B_i (n, m_i): columns of B whose inputs node i is told, in the order of ``plant.inputs``."""

@@ -219,6 +219,15 @@ class Run(Strict):
     batch: Annotated[
         int, Field(ge=1, le=10_000, description="steps fused as one block (admm only); estimates come so much late")
     ] = 1
+    on_node_loss: Annotated[
+        Literal["stop", "degrade", "restart"], Field(description="when a node's process is lost: end, go on, replace")
+    ] = "stop"
+    rejoin: Annotated[
+        Literal["warm", "cold"], Field(description="a replaced node starts from its neighbours' estimates, or afresh")
+    ] = "warm"
+    max_seconds: Annotated[
+        float | None, Field(gt=0, le=31_536_000, description="a run that takes longer fails; default: no limit")
+    ] = None
 
 
 class GilbertElliott(Strict):
@@ -303,11 +312,16 @@ class NodeFault(OneOf):
     pause: Annotated[int | None, Field(ge=0, description="the step")] = None
     restart: Annotated[int | None, Field(ge=0, description="the step")] = None
     seconds: Annotated[float | None, Field(gt=0, le=86_400, description="how long a pause lasts")] = None
+    away: Annotated[
+        int | None, Field(ge=1, le=1_000_000, description="steps until it is back after a restart; default 10")
+    ] = None
 
     @model_validator(mode="after")
     def _seconds_belong_to_pause(self) -> NodeFault:
         if (self.seconds is None) != (self.pause is None):
             raise _misfit("pause and seconds belong together: {node, pause: step, seconds: how long}")
+        if self.away is not None and self.restart is None:
+            raise _misfit("belongs to restart: {node, restart: step, away: steps}", at="away")
         return self
 
 

@@ -10,6 +10,7 @@ from duio_mesh.errors import DesignError
 from duio_mesh.observers.base import can_batch
 from duio_mesh.scenario.model import Scenario
 from duio_mesh.synthesis.design import Design
+from duio_mesh.synthesis.recovery import with_recovery
 
 __all__ = ["Design", "options_of", "synthesise"]
 
@@ -26,10 +27,6 @@ def synthesise(scenario: Scenario, progress: Callable[[str], None] = lambda _: N
     ``progress`` is called with a short sentence before each long piece of work.
     Raises DesignError when a condition fails or no gains exist; the message says which, where and by how much.
     """
-    if scenario.faults.nodes:
-        raise DesignError(
-            "faults.nodes: kill, pause and restart cannot be carried out yet; take them out (links and cuts can)"
-        )
     observer = importlib.import_module(f"duio_mesh.observers.{scenario.method}").Observer
     if (batch := scenario.run.batch) > 1 and not can_batch(observer):
         raise DesignError(
@@ -37,4 +34,4 @@ def synthesise(scenario: Scenario, progress: Callable[[str], None] = lambda _: N
             "steps at once; remove run.batch, or use a method without memory between its fusions (admm)"
         )
     design: Design = importlib.import_module(f"duio_mesh.synthesis.{scenario.method}").design(scenario, progress)
-    return design
+    return design if scenario.run.on_node_loss == "stop" else with_recovery(design, progress)

@@ -10,12 +10,12 @@ from __future__ import annotations
 
 import importlib
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import numpy as np
 
 from duio_mesh.errors import DesignError
-from duio_mesh.scenario.model import Graph
 from duio_mesh.synthesis.design import Design, Progress
 from duio_mesh.synthesis.losses import Loss, losses, restricted, without
 
@@ -32,58 +32,60 @@ def with_contingency(design: Design, number: int, progress: Progress = lambda _:
 def contingency(design: Design, number: int = 1, progress: Progress = lambda _: None) -> dict[str, Any]:
     """Every loss of up to ``number`` edges and nodes, as plain data.
 
-    ``nominal``, ``nominal_failing``: as a case, without a loss. ``cases``: per loss ``lost`` in words, ``links`` and
-    ``nodes``, ``radius`` (None when the estimates go to something wrong), ``reconstructs``, and ``failing``: the
-    islands whose errors do not contract. ``worst``: what is lost in the case with the largest radius. ``survives``:
-    all cases reconstruct. ``left``, of methods that start afresh in every step: what a step leaves of the error.
+    ``nominal``, ``nominal_failing``: as a case, without a loss. ``cases``: per loss, see ``Cases``. ``worst``: what is
+    lost in the case with the largest radius. ``survives``: all cases reconstruct.
     Raises DesignError when the method has no error matrix to offer or ``number`` is less than 1.
     """
-    method = importlib.import_module(f"duio_mesh.synthesis.{design.scenario.method}")
-    if not hasattr(method, "error_radius"):
-        raise DesignError(f"contingency: {design.scenario.method} says nothing about its errors on another graph")
     if number < 1:
         raise DesignError(f"contingency: should be at least 1 edge or node, not {number}")
-    graph, known = design.scenario.graph, dict[Graph, float]()
-
-    def radius(island: Graph) -> float:
-        """An island that a loss does not touch is as it was."""
-        if island not in known:
-            known[island] = float(method.error_radius(design, island))
-        return known[island]
-
-    leaves = getattr(method, "error_left", None)
-
-    def left_over(island: Graph) -> float:
-        return float(leaves(design, island)) if leaves else 0.0
-
-    def case(loss: Loss) -> dict[str, Any]:
-        left = without(graph, loss)
-        radii = {island: radius(restricted(left, island)) for island in left.islands()}
-        failing = [list(island) for island, value in radii.items() if not value < CONTRACTS]
-        return {
-            "lost": loss.words(graph),
-            "links": [list(link) for link in loss.links],
-            "nodes": list(loss.nodes),
-            "radius": _plain(max(radii.values())),
-            "reconstructs": not failing,
-            "failing": failing,
-        } | ({"left": _plain(max(left_over(restricted(left, ids)) for ids in radii))} if leaves else {})
-
-    progress("contingency: nothing lost")
+    case = Cases(design, progress)
     nominal = case(Loss())
-    cases = []
-    for loss in losses(graph, number):
-        progress(f"contingency: {loss.words(graph)}")
-        cases.append(case(loss))
+    cases = [case(loss) for loss in losses(design.scenario.graph, number)]
     worst = max(cases, key=lambda c: np.inf if c["radius"] is None else c["radius"], default=None)
     return {
-        "radius_of": method.RADIUS_OF,
+        "radius_of": case.radius_of,
         "nominal": nominal["radius"],
         "nominal_failing": nominal["failing"],
         "cases": cases,
         "worst": worst["lost"] if worst else None,
         "survives": all(c["reconstructs"] for c in cases),
     }
+
+
+class Cases:
+    """What is left of one design after a loss, as plain data; islands that a loss does not touch are computed once.
+
+    ``lost`` in words, ``links`` and ``nodes``, ``radius`` (None when the estimates go to something wrong),
+    ``reconstructs``, and ``failing``: the islands whose errors do not contract. ``left``, of methods that start afresh
+    in every step: what a step leaves of the error.
+    """
+
+    def __init__(self, design: Design, progress: Progress = lambda _: None) -> None:
+        """Raises DesignError when the method has no error matrix to offer."""
+        method = importlib.import_module(f"duio_mesh.synthesis.{design.scenario.method}")
+        if not hasattr(method, "error_radius"):
+            raise DesignError(f"contingency: {design.scenario.method} says nothing about its errors on another graph")
+        self._graph, self._progress = design.scenario.graph, progress
+        self.radius_of: str = method.RADIUS_OF
+        self._radius = cache(lambda island: float(method.error_radius(design, island)))
+        self._left = cache(lambda island: float(method.error_left(design, island)))
+        self._afresh = hasattr(method, "error_left")
+
+    def __call__(self, loss: Loss) -> dict[str, Any]:
+        """The case of one loss."""
+        self._progress(f"contingency: {loss.words(self._graph) or 'nothing lost'}")
+        left = without(self._graph, loss)
+        islands = {ids: restricted(left, ids) for ids in left.islands()}
+        radii = {ids: self._radius(island) for ids, island in islands.items()}
+        failing = [list(ids) for ids, value in radii.items() if not value < CONTRACTS]
+        return {
+            "lost": loss.words(self._graph),
+            "links": [list(link) for link in loss.links],
+            "nodes": list(loss.nodes),
+            "radius": _plain(max(radii.values())),
+            "reconstructs": not failing,
+            "failing": failing,
+        } | ({"left": _plain(max(map(self._left, islands.values())))} if self._afresh else {})
 
 
 def _plain(value: float) -> float | None:

@@ -49,9 +49,13 @@ def node_spec(
         credit=_quarter(run),
         block=_quarter(run),
         batch=run.batch,
-        faults=scenario.faults.into(i),
+        faults=scenario.faults.into(i, () if run.on_node_loss == "stop" else scenario.graph.hears(i)),
         spoils=scenario.faults.spoilt_by(i),
-        without=scenario.options.without if scenario.faults.links else "",
+        without=scenario.options.without if scenario.patchy else "",
+        on_loss=run.on_node_loss,
+        warm=run.rejoin == "warm",
+        acts=scenario.faults.of(i),
+        breaks=tuple(scenario.faults.returns()),
     )
 
 
@@ -61,8 +65,11 @@ def _window(run: Run) -> int:
 
 
 def _quarter(run: Run) -> int:
-    """Steps between two words from node to plant, and in one frame from plant to node: few enough to keep both busy."""
-    return max(1, _window(run) // 4)
+    """Steps between two words from node to plant, and in one frame from plant to node: few enough to keep both busy.
+
+    Whole batches, because a node that comes back does so between two blocks.
+    """
+    return max(1, _window(run) // 4 // run.batch) * run.batch
 
 
 def plant_spec(scenario: Scenario) -> PlantSpec:
@@ -100,6 +107,8 @@ def plant_spec(scenario: Scenario) -> PlantSpec:
         window=_window(run),
         block=_quarter(run),
         deadline=run.deadline,
+        on_loss=run.on_node_loss,
+        returns=scenario.faults.returns(),
     )
 
 
