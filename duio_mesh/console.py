@@ -46,7 +46,8 @@ def progress(design: Design) -> Iterator[launcher.Show]:
         def show(now: launcher.Progress) -> None:
             speed = bar.tasks[0].speed
             rate = f"{speed:,.0f} steps/s" if speed else ""
-            bar.update(task, completed=now.steps, rate=rate, errors=errors_in_words(now.errors))
+            errors = f"[yellow]{escape(now.waiting)}[/]" if now.waiting else errors_in_words(now.errors)
+            bar.update(task, completed=now.steps, rate=rate, errors=errors)
 
         yield show
 

@@ -20,6 +20,7 @@ from duio_mesh import credentials
 from duio_mesh.arrays import Array
 from duio_mesh.errors import RunError
 from duio_mesh.faults import COUNTED
+from duio_mesh.recovery import Recovery
 from duio_mesh.report.description import describe
 from duio_mesh.report.metrics import metrics
 from duio_mesh.report.trace_file import write_trace
@@ -41,6 +42,7 @@ class Progress:
 
     steps: int  # finished by every node
     errors: Mapping[int, float]  # node id -> RMS over the states of its newest error; empty before
+    waiting: str = ""  # who waits for whom, once that takes long
 
 
 Show: TypeAlias = Callable[[Progress], None]
@@ -124,12 +126,21 @@ class Launch:
     def go(self, show: Show, watcher: Watcher | None) -> None:
         """Start everybody and stay until plant and nodes are done. Raises RunError, or KeyboardInterrupt."""
         try:
-            for who, spec in self.specs().items():
+            run, specs = self._design.scenario.run, self.specs()
+            for who, spec in specs.items():
                 write_spec(spec, self._folder.spec(who))
-                kind = who.split("-")[0]
-                logs = (self._folder.log(who, "jsonl"), self._folder.log(who, "err"))
-                self._supervisor.start(who, kind, self._folder.spec(who), *logs)
-            self._supervisor.watch(lambda: self._look(show, watcher), self._design.plant.deadline)
+                self._supervisor.start(who, who.split("-")[0], *self._files(who))
+
+            def replace_node(who: str, before: int) -> None:
+                spec = specs[who]
+                assert isinstance(spec, NodeSpec)  # noqa: S101
+                write_spec(replace(spec, incarnation=before), self._folder.spec(who))
+                self._supervisor.replace(who, "node", *self._files(who))
+
+            recover = None
+            if run.on_node_loss != "stop":
+                recover = Recovery(self._supervisor, run.on_node_loss, replace_node)
+            self._supervisor.watch(lambda: self._look(show, watcher), run.deadline, recover, run.max_seconds)
             if self._record:
                 if watcher and self._url:
                     watcher.ended(self._url)
@@ -137,6 +148,15 @@ class Launch:
                 self._supervisor.finish("recorder", CLOSING + rows / CLOSING_ROWS)
         finally:
             self._wiring.release()
+
+    def _finished(self, steps: Mapping[int, int]) -> int:
+        """Steps that every node has done that is there."""
+        processes = self._supervisor.processes
+        return min((k for i, k in steps.items() if processes[f"node-{i}"].there), default=0)
+
+    def _files(self, who: str) -> tuple[Path, Path, Path]:
+        """A process' spec, log and standard error."""
+        return self._folder.spec(who), self._folder.log(who, "jsonl"), self._folder.log(who, "err")
 
     def _look(self, show: Show, watcher: Watcher | None) -> int:
         """Show the progress; how many bytes all journals have grown to."""
@@ -153,7 +173,7 @@ class Launch:
             estimate = _row(files[i], self._sizes[i], k - 1)
             if x is not None and estimate is not None:
                 errors[i] = float(np.sqrt(np.mean((estimate[:n] - x) ** 2)))
-        show(Progress(min(steps.values()), errors))
+        show(Progress(self._finished(steps), errors, self._supervisor.waiting()))
         return sum(sizes.values())
 
 
@@ -267,6 +287,7 @@ def gather(folder: RunFolder, design: Design, supervisor: Supervisor, seconds: f
         "rounds_per_second": rounds / took if took else 0.0,
         "messages": sum(node["frames"] for node in nodes),
         "rejected": {who: done["rejected"] for who, done in said.items() if done.get("rejected")},
+        "events": supervisor.events,
         "failure": failed,
     }
     recorder = supervisor.processes.get("recorder")

@@ -26,7 +26,7 @@ from duio_mesh.mesh import Mesh
 from duio_mesh.mesh.faulty import LONG_WAY, Arrived, FaultyExchange
 from duio_mesh.mesh.lockstep import Exchange, Line, LinkLost, Lockstep
 from duio_mesh.mesh.rejoin import HELLO, JOINED, ask, come_back
-from duio_mesh.observers import Observer, make_observer
+from duio_mesh.observers import make_observer
 from duio_mesh.observers.absence import Late, flagged, neighbours_mean, part_with, start_again, take_late, welcome
 from duio_mesh.observers.base import reader
 from duio_mesh.observers.watch import watcher

@@ -101,6 +101,7 @@ class Nursery:
         parent = os.getpid()
         pid = os.fork()
         if pid:
+            self._tell({"event": "started", "who": order["who"], "pid": pid})
             return pid
         code = 70
         try:

@@ -84,7 +84,7 @@ class Credits:
                     ) from None
                 if not said:
                     said = True
-                    self._report("waiting", on=who, link="", k=steps - 1, r=0)
+                    self._report("waiting", on=who, link="", k=steps - 1, r=0, waited=time.monotonic() - heard)
         if said:
             self._report("moving")
 

@@ -9,9 +9,9 @@ import numpy as np
 
 from duio_mesh.arrays import Array
 from duio_mesh.dynamics import Plant
+from duio_mesh.errors import RunError
 from duio_mesh.faults import Reception, Stamp
 from duio_mesh.observers import make_observer
-from duio_mesh.errors import RunError
 from duio_mesh.observers.absence import Late, flagged, neighbours_mean, part_with, start_again, take_late, welcome
 from duio_mesh.observers.base import NOTHING, reader
 from duio_mesh.observers.watch import watcher

@@ -17,16 +17,22 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Self, TypeAlias
 
 from duio_mesh.errors import RunError
-from duio_mesh.spec import START
+from duio_mesh.spec import PATIENCE, START
 
 FRAME = 0.1  # seconds between looks at the progress
-PATIENCE = 2.0  # seconds beyond the deadline that a process has for saying itself what it waited for
+MARGIN = 2.0  # seconds beyond the deadline that a process has for saying itself what it waited for
 GATHER = 0.3  # seconds after the first failure in which others may say what they saw
 END = 2.0  # seconds for asked processes to end before they are made to
+LONGER = PATIENCE + 1  # deadlines, where lost nodes are survived: their own waits may last PATIENCE of them
+STATES = {"T": "stopped", "t": "stopped by a debugger", "D": "waiting for a disk"}  # of /proc/<pid>/stat
+TOLD = ("lost", "joined", "back", "dying", "pausing", "resumed", "waiting")
 THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
+
+
+Recover: TypeAlias = "Callable[[Process], bool] | None"
 
 
 class Process:
@@ -39,6 +45,13 @@ class Process:
         self.failure = ""  # what it says went wrong
         self.code: int | None = None  # exit code; negative is a signal
         self.warnings: list[str] = []
+        self.pid = 0
+        self.waits: dict[str, Any] = {}  # what it says that it waits for, when that takes long ...
+        self.since = 0.0  # ... since when
+        self.wakes: float | None = None  # it is stopped on purpose until then
+        self.before = 0  # processes of this name before it
+        self.back = False  # it replaces one and is in step
+        self.there = True  # False: the run goes on without it
 
     @property
     def essential(self) -> bool:
@@ -51,6 +64,20 @@ class Process:
             return f"{self.who} was killed by {signal.Signals(-self.code).name}"
         return self.failure or f"{self.who} ended with exit code {self.code}"
 
+    def waiting(self) -> str:
+        """What it waits for, in words."""
+        on, link, k, r = (self.waits[key] for key in ("on", "link", "k", "r"))
+        at = f"{link}, step {k}, round {r}" if link else f"step {k}"
+        return f"{self.who} waits for {' and '.join(on)} ({at})"
+
+    def state(self) -> str:
+        """What the operating system says that it is doing; "" when that is nothing special or cannot be told."""
+        try:
+            stat = Path(f"/proc/{self.pid}/stat").read_text()
+        except OSError:
+            return ""
+        return STATES.get(stat.rpartition(")")[2].split()[0], "")
+
 
 class Supervisor:
     """The launcher's end of a nursery; a context manager that leaves no process behind."""
@@ -58,6 +85,8 @@ class Supervisor:
     def __init__(self) -> None:
         """Start the nursery; it gets ready by itself while the caller goes on."""
         self.processes: dict[str, Process] = {}
+        self.events: list[dict[str, Any]] = []  # what has happened to nodes on the way
+        self._begin = time.monotonic()
         self._beats = 0  # whatever anybody says shows that things move
         self._status, write = os.pipe()
         self._control, theirs = socket.socketpair()
@@ -96,28 +125,98 @@ class Supervisor:
         self.processes.setdefault(who, Process(who))
         self._order({"start": kind, "who": who, "spec": str(spec), "log": str(log), "errors": str(errors)})
 
+    def replace(self, who: str, kind: str, spec: Path, log: Path, errors: Path) -> None:
+        """Start another process in place of one that has ended."""
+        before = self.processes[who]
+        fresh = self.processes[who] = Process(who)
+        fresh.before, fresh.warnings = before.before + 1, before.warnings
+        self.start(who, kind, spec, log, errors)
+
     def kill(self, who: str, number: int) -> None:
         """Send a signal to one process."""
         self._order({"who": who, "signal": number})
 
-    def watch(self, look: Callable[[], int], deadline: float) -> None:
-        """Until plant and nodes are done, or one of them is not well.
+    def watch(
+        self, look: Callable[[], int], deadline: float, recover: Recover = None, limit: float | None = None
+    ) -> None:
+        """Until plant and nodes are done, or one of them is not well and ``recover`` does not know what to do about it.
 
         ``look`` is called ten times a second, shows the progress and returns a number that grows with it.
+        ``recover(process)`` is called with one that has ended without being done; whether the run goes on. ``limit``:
+        seconds for everything.
         Raises RunError naming the process, or the edge, step and round that a process reported.
         """
-        seen, since = (-1, 0), time.monotonic()
+        begin = since = time.monotonic()
+        seen = (-1, 0)
         while not all(p.code == 0 for p in self._essential()):
             self._listen(FRAME)
-            if any(p.failure or p.code for p in self._essential()):
+            self._wake()
+            for p in self._essential():
+                if p.code and recover and recover(p):
+                    since = time.monotonic()
+            if any(p.code or (p.failure and not self._recovers(p, recover)) for p in self._essential()):
                 self._until(lambda: False, GATHER)
                 raise RunError(self._diagnosis())
-            if (now := (look(), self._beats)) != seen:
-                seen, since = now, time.monotonic()
-            elif time.monotonic() - since > self._allowed(deadline):
+            if self.processes["plant"].code == 0:
+                self._end_the_late()
+            now = time.monotonic()
+            if limit is not None and now - begin > limit:
+                raise RunError(f"the run took longer than run.max_seconds = {limit:g} s{self._who_waits()}")
+            if (news := (look(), self._beats)) != seen:
+                seen, since = news, now
+            if recover:
+                self._end_the_stuck(deadline)
+            if now - since > self._allowed(deadline) * (LONGER if recover else 1):
                 stuck = ", ".join(p.who for p in self._essential() if not p.done)
-                raise RunError(f"nothing has moved for {time.monotonic() - since:.1f} s; not finished: {stuck}")
+                raise RunError(f"nothing has moved for {now - since:.1f} s; not finished: {stuck}{self._who_waits()}")
         look()
+
+    @staticmethod
+    def _recovers(process: Process, recover: Recover) -> bool:
+        """Whether its failure may be survived, once it has ended."""
+        return recover is not None and process.who != "plant"
+
+    def _end_the_late(self) -> None:
+        """The plant is done, so whoever is not back in step has come too late."""
+        for p in self._essential():
+            if p.before and not p.back and p.code is None:
+                p.there = False
+                p.warnings.append("the run was over before it was back in step")
+                self.kill(p.who, signal.SIGKILL)
+
+    def waiting(self) -> str:
+        """Who waits for whom, and what the operating system says of those who keep others waiting; "" when nobody."""
+        waits = [p.waiting() for p in self._essential() if p.waits]
+        waits += [f"{p.who} is {p.state()}" for p in self._roots() if p.state()]
+        return "; ".join(waits)
+
+    def _who_waits(self) -> str:
+        return f" ({words})" if (words := self.waiting()) else ""
+
+    def _roots(self) -> list[Process]:
+        """Those that others wait for and who do not wait themselves, or only think so: they are stopped."""
+        found: dict[str, Process] = {}
+        for p in self._essential():
+            for who in p.waits.get("on", ()):
+                other = self.processes[who]
+                if other.there and (not other.waits or other.state()):
+                    found[who] = other
+        return list(found.values())
+
+    def _end_the_stuck(self, deadline: float) -> None:
+        """Kill who has kept the others waiting for longer than the deadline: then it is lost, for certain."""
+        now = time.monotonic()
+        late = [p for p in self._essential() if p.waits and now - p.since > deadline]
+        for p in self._roots() if late else ():
+            if p.who != "plant" and any(p.who in other.waits["on"] for other in late) and p.code is None:
+                p.warnings.append(f"kept {', '.join(o.who for o in late)} waiting for {deadline:g} s; killed")
+                self.kill(p.who, signal.SIGKILL)
+
+    def _wake(self) -> None:
+        """Continue those that were stopped on purpose, until they say that they have felt it."""
+        for p in self.processes.values():
+            if p.wakes is not None and p.code is None and time.monotonic() >= p.wakes:
+                self.kill(p.who, signal.SIGCONT)
 
     def finish(self, who: str, timeout: float) -> bool:
         """Ask a process to finish and wait for its end; whether it ended well."""
@@ -137,16 +236,17 @@ class Supervisor:
 
     def _allowed(self, deadline: float) -> float:
         started = all(p.said for p in self._essential())
-        return (deadline if started else START) + PATIENCE
+        return (deadline if started else START) + MARGIN
 
     def _essential(self) -> list[Process]:
-        return [p for p in self.processes.values() if p.essential]
+        return [p for p in self.processes.values() if p.essential and p.there]
 
     def _diagnosis(self) -> str:
         """Who was the first cause: a killed process before one that failed by itself, before one that lost a peer."""
         killed = [p.death() for p in self._essential() if p.code and p.code < 0]
         failed = [p.failure for p in self._essential() if p.failure]
-        return "; ".join(killed + failed) or "; ".join(p.death() for p in self._essential() if p.code)
+        stopped = [f"{p.who} is {p.state()}" for p in self._roots() if p.state()]
+        return "; ".join(killed + failed + stopped) or "; ".join(p.death() for p in self._essential() if p.code)
 
     def _until(self, done: Callable[[], bool], timeout: float) -> None:
         end = time.monotonic() + timeout
@@ -184,5 +284,23 @@ class Supervisor:
             process.failure = event["text"]
         elif what == "warning":
             process.warnings.append(event["text"])
+        elif what == "started":
+            process.pid = event["pid"]
+        elif what == "waiting":
+            process.waits, process.since = event, time.monotonic() - event["waited"]
+        elif what == "moving":
+            process.waits = {}
+        elif what == "pausing":
+            process.wakes = time.monotonic() + event["seconds"]
+        elif what == "resumed":
+            process.wakes = None
+        elif what == "back":
+            process.back = True
         elif what == "exit":
-            process.code = event["code"]
+            process.code, process.waits = event["code"], {}
+        if what in TOLD:
+            self.note(what, **{key: value for key, value in event.items() if key != "event"})
+
+    def note(self, what: str, **fields: Any) -> None:
+        """Keep an event for whoever wants to know afterwards what happened on the way."""
+        self.events.append({"seconds": round(time.monotonic() - self._begin, 3), "event": what, **fields})

@@ -226,7 +226,7 @@ class Lockstep:
             line, k, r = at
             if now - since > soon(self._deadline) and not told:
                 told = True
-                self._say("waiting", on=[line.who], link=line.name, k=k, r=r)
+                self._say("waiting", on=[line.who], link=line.name, k=k, r=r, waited=now - since)
             if now - since > self._deadline:
                 line.late = at
             if line.gone or line.late is at:
