@@ -22,7 +22,7 @@ from duio_mesh.arrays import Array
 from duio_mesh.errors import RunError
 from duio_mesh.faults import NodeFault
 from duio_mesh.journal import Journal
-from duio_mesh.mesh import Mesh
+from duio_mesh.mesh import Member, Mesh
 from duio_mesh.mesh.faulty import LONG_WAY, Arrived, FaultyExchange
 from duio_mesh.mesh.lockstep import Exchange, Line, LinkLost, Lockstep
 from duio_mesh.mesh.rejoin import HELLO, JOINED, ask, come_back
@@ -40,7 +40,7 @@ RETURN = 1.0  # seconds in which a neighbour answers a process that comes back, 
 
 def run(spec: NodeSpec, report: Report) -> None:
     """Run one node for ``spec.steps`` steps. Raises RunError when a neighbour or the plant is lost or late."""
-    with Mesh(spec.wire, f"node-{spec.id}", report.warn) as mesh:
+    with Mesh(spec.wire, f"node-{spec.id}", report.warn, spec.incarnation) as mesh:
         links = Links(spec, mesh, report)
         mesh.watch(links.lockstep.noticed)
         with links.lockstep:
@@ -104,13 +104,12 @@ class Links:
         spec, back, self.back = self._spec, self.back, {}
         for j, before in back.items():
             near = j != spec.id and (j in spec.hears or j in spec.tells)
-            if not near or not self.mesh.await_birth(f"node-{j}", before + 1, RETURN):
+            if not near or not self.mesh.await_birth(Member(f"node-{j}", before), RETURN):
                 continue  # gone again already: it stays lost
             if j in spec.tells and spec.warm and k:
                 self.told.send_to(spec.tells.index(j), k, HELLO, self.observer.estimate().state)
             if j in spec.hears and isinstance(self.exchange, FaultyExchange):
-                self.heard[j].gone = False
-                self.heard[j].gone = not self.mesh.alive(f"node-{j}")  # in this order: no death goes unnoticed
+                self.heard[j].expect(before)
                 self.exchange.welcome(j)
                 welcome(self.observer, j)
                 self._report("joined", node=j, k=k)
@@ -123,15 +122,22 @@ def rejoin(spec: NodeSpec, links: Links, report: Report) -> int:
     mesh.unanswered(RETURN)  # who does not answer is gone itself
     report("ready")
     k, data, joined, away = ask(links.lockstep, links.plant, links.credit, spec.incarnation)
+    links.lockstep.first = k
     links.observer = make_observer(replace(spec, steps=spec.steps - k))
     told = []
     for j, line in links.heard.items():
-        if j in joined or not exchange.expects(j, k):
-            continue  # it knows no more than we do, or is not there, as planned
+        if not exchange.expects(j, k):
+            continue  # not there, as planned
         try:
-            if j in away or not mesh.await_birth(f"node-{j}", 1, RETURN):
-                raise LinkLost(f"node-{j} was gone when node-{spec.id} came back")
-            if spec.warm and data.size:
+            there = None
+            if j in joined:
+                there = Member(line.who, joined[j]) if mesh.await_birth(Member(line.who, joined[j]), RETURN) else None
+            elif j not in away:
+                there = mesh.await_somebody(line.who, RETURN)
+            if there is None:
+                raise LinkLost(f"{line.who} was gone when node-{spec.id} came back")
+            line.expect(there.before)
+            if spec.warm and data.size and j not in joined:  # who comes back, too, knows no more than we do
                 told.append(links.lockstep.take(line, k, HELLO, spec.n))
         except LinkLost as e:
             exchange.lose(j, k, 0, str(e))

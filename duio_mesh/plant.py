@@ -93,13 +93,15 @@ class Credits:
         if got is None:  # somebody has gone
             if self._spec.on_loss != "stop":
                 for i, source in self._sources.items():
-                    if source.gone:
+                    if source.gone and self._done[i] < self._spec.steps:
                         source.gone = False
                         self.away.add(i)
             return
         i, frame = self._ids[got[0]], got[1]
         if frame.r == ASK:
-            self._asking[i] = frame.k
+            self._asking[i] = got[0].before = frame.k
+            got[0].gone = False
+            self.away.add(i)
         else:
             self._done[i] = max(self._done[i], min(frame.k, self._spec.steps))
 

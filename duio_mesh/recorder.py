@@ -54,7 +54,7 @@ def run(spec: RecorderSpec, report: Report) -> None:
             node_of[mesh.hear(keys.trace(i), f"{i} -> recorder", f"node-{i}")] = i
         # last, because the plant starts when it sees this one
         node_of[mesh.hear(keys.truth(), "plant -> recorder", "plant", ("plant", "recorder"))] = None
-        mesh.watch(lambda who, alive: changes.put((who, alive)))
+        mesh.watch(lambda member, alive: changes.put((member.who, alive)))
         report("ready", url=recording.url)
         newest = {"plant": 0} | {f"node-{i}": 0 for i in spec.sizes}
         pause = PERIOD if spec.live else RATE_PERIOD

@@ -7,6 +7,6 @@ from __future__ import annotations
 
 from duio_mesh.mesh.frames import Decoder, Encoder, Frame, Rejected
 from duio_mesh.mesh.keys import Keys
-from duio_mesh.mesh.session import Mesh, Outlet, Source
+from duio_mesh.mesh.session import Member, Mesh, Outlet, Source
 
-__all__ = ["Decoder", "Encoder", "Frame", "Keys", "Mesh", "Outlet", "Rejected", "Source"]
+__all__ = ["Decoder", "Encoder", "Frame", "Keys", "Member", "Mesh", "Outlet", "Rejected", "Source"]

@@ -34,6 +34,6 @@ class Keys(NamedTuple):
         """Plant to the recorder: batches of true states."""
         return f"duio/{self.run}/truth"
 
-    def alive(self, who: str) -> str:
-        """Liveliness token of a process; ``*`` for all."""
-        return f"duio/{self.run}/alive/{who}"
+    def alive(self, who: str, before: int = 0) -> str:
+        """Liveliness token of a process, which replaces ``before`` others; ``**`` for all."""
+        return f"duio/{self.run}/alive/{who}" + (f"/{before}" if before else "")

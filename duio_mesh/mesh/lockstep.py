@@ -25,7 +25,7 @@ import zenoh
 from duio_mesh.arrays import Array
 from duio_mesh.errors import RunError
 from duio_mesh.mesh.frames import FLOAT64, RESIDUE, TAIL, Decoder, Frame, Rejected, prefix, stamp
-from duio_mesh.mesh.session import Mesh, Outlet, Ready, Source
+from duio_mesh.mesh.session import Member, Mesh, Outlet, Ready, Source
 
 ROOM = 4  # frames per step of the window that may wait
 FEW = 48  # numbers
@@ -87,6 +87,11 @@ class Line(Source):
         self._mesh, self._key = mesh, key
         mesh.sources.append(self)
 
+    def expect(self, before: int) -> None:
+        """The other end is the process that replaces so many others."""
+        self.before, self.gone = before, False
+        self.gone = not self._mesh.alive(Member(self.who, before))  # in this order, no death goes unnoticed
+
     def knock(self) -> None:
         """Let ``receive`` return ``KNOCK``, after everything that has come."""
         self._mesh.tell_self(self._key, KNOCK)
@@ -101,6 +106,7 @@ class Lockstep:
         ``say`` is called as say("waiting", on=, link=, k=, r=) when one lasts long, say("moving") when that is over.
         """
         self._mesh, self._deadline, self._say = mesh, deadline, say
+        self.first = 0  # earlier steps' frames were meant for a process before this one
         self._at: tuple[Line, int, int] | None = None  # what the main thread waits for
         self._news, self._over = threading.Event(), False
         self._watchdog = threading.Thread(target=self._watch, name="watchdog", daemon=True)
@@ -187,6 +193,8 @@ class Lockstep:
         except Rejected as e:
             self._mesh.reject(line, e.cause)
             return
+        if frame.k < self.first:
+            return
         kept = line.excused.pop(frame[:2], None)
         if kept is not None:
             if kept:
@@ -203,11 +211,10 @@ class Lockstep:
             return f"{self._mesh.who} lost {line.who} while waiting on {line.name} for step {k}, round {r}"
         return f"{self._mesh.who} waited {self._deadline:g} s on {line.name} for step {k}, round {r}: {line.doing()}"
 
-    def noticed(self, who: str, alive: bool) -> None:
+    def noticed(self, member: Member, alive: bool) -> None:
         """A directly linked process came or went (``Mesh.watch``)."""
         if not alive:
-            for source in self._mesh.sources:
-                source.gone = source.gone or source.who == who
+            self._mesh.bury(member)
             self._news.set()
 
     def _watch(self) -> None:

@@ -112,10 +112,10 @@ def _allowed(keys: Keys, guard: Guard, peer: str) -> Iterator[tuple[str, str, li
     if peer in guard.tells:
         yield "egress", "put", [data_key(keys, guard.who, peer)]
         yield "ingress", "declare_subscriber", _subscriptions(keys, guard.who, peer)
-    yield "ingress", "liveliness_token", [keys.alive(peer)]
-    yield "egress", "liveliness_token", [keys.alive(guard.who)]
+    yield "ingress", "liveliness_token", [keys.alive(f"{peer}/**")]
+    yield "egress", "liveliness_token", [keys.alive(f"{guard.who}/**")]
     for flow in ("ingress", "egress"):
-        yield flow, "declare_liveliness_subscriber", [keys.alive("*")]
+        yield flow, "declare_liveliness_subscriber", [keys.alive("**")]
 
 
 def _subject(run: str, guard: Guard, peer: str) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterable
 from functools import partial
 from queue import Empty, SimpleQueue
 from types import TracebackType
-from typing import Any, Self, TypeAlias
+from typing import Any, NamedTuple, Self, TypeAlias
 
 # Before the first zenoh.open: all of Zenoh's work on one thread, except sending, which keeps its own (handing that over
 # as well can deadlock). About 1.3 times the rounds per second of the default runtime, and 4 threads instead of 9.
@@ -69,12 +69,19 @@ def _matched(news: SimpleQueue[str], name: str, status: Any) -> None:
         news.put(name)
 
 
+class Member(NamedTuple):
+    """One process, whatever it is called."""
+
+    who: str
+    before: int = 0  # processes of that name before it
+
+
 class Source:
     """One incoming key: who sends on it, what it has sent, and what of it was refused."""
 
     def __init__(self, name: str, who: str, decode: Decoder) -> None:
         self.name = name  # as the user knows it: "edge 3 -> 2"
-        self.who = who  # the process: "node-3"
+        self.who, self.before = who, 0  # the process: "node-3", and how many of that name there were before it
         self.decode = decode
         self.last: tuple[int, int] | None = None  # (k, r) of the newest good frame
         self.rejected: Counter[str] = Counter()
@@ -124,14 +131,17 @@ class Mesh:
     Declare sources and outlets, then ``meet`` (the start barrier), then ``get`` and ``send``.
     """
 
-    def __init__(self, wire: Wire, who: str, warn: Callable[[str], None] = lambda _: None) -> None:
-        """Open the session. Raises RunError when an endpoint cannot be used or reached."""
-        self.who, self.keys = who, Keys(wire.run)
+    def __init__(self, wire: Wire, who: str, warn: Callable[[str], None] = lambda _: None, before: int = 0) -> None:
+        """Open the session of a process that replaces ``before`` others of its name.
+
+        Raises RunError when an endpoint cannot be used or reached.
+        """
+        self.who, self.keys, self._before = who, Keys(wire.run), before
         self._warn = warn
-        self._queue: SimpleQueue[tuple[Source | str, bytes | None]] = SimpleQueue()
+        self._queue: SimpleQueue[tuple[Source | Member, bytes | None]] = SimpleQueue()
         self.sources: list[Source] = []
-        self._seen = threading.Condition()
-        self._births, self._deaths = Counter[str](), Counter[str]()  # of processes with a direct link, as announced
+        self._news = threading.Condition()
+        self._seen, self._here = set[Member](), set[Member]()  # processes with a direct link: ever, and at present
         self._meeting: dict[str, Any] = {}  # name of a link -> publisher that must match before the start
         self._kept: list[Any] = []
         try:
@@ -193,39 +203,48 @@ class Mesh:
                 self._meeting[name] = self._session.declare_publisher(self.keys.ready(*ready))
         return Outlet(Encoder(self.keys.run, self.who), publishers)
 
-    def watch(self, changed: Callable[[str, bool], None] | None = None) -> None:
-        """Announce this process and notice when a directly linked one comes or goes (``changed(who, alive)``).
+    def watch(self, changed: Callable[[Member, bool], None] | None = None) -> None:
+        """Announce this process and notice when a directly linked one comes or goes (``changed(member, alive)``).
 
-        ``changed`` is called on a thread of Zenoh's and must return at once.
+        ``changed`` is called on a thread of Zenoh's and must return at once. To be called after everything that this
+        process hears has been declared: who sees it announced can reach it.
         """
-        self._kept.append(self._session.liveliness().declare_token(self.keys.alive(self.who)))
+        self._kept.append(self._session.liveliness().declare_token(self.keys.alive(self.who, self._before)))
         put, start = self._queue.put, len(self.keys.alive(""))
 
         def seen(sample: Any) -> None:
-            who, alive = str(sample.key_expr)[start:], sample.kind == zenoh.SampleKind.PUT
-            with self._seen:
-                (self._births if alive else self._deaths)[who] += 1
-                self._seen.notify_all()
+            who, _, before = str(sample.key_expr)[start:].partition("/")
+            member, alive = Member(who, int(before or 0)), sample.kind == zenoh.SampleKind.PUT
+            with self._news:
+                if alive:
+                    self._seen.add(member)
+                    self._here.add(member)
+                else:
+                    self._here.discard(member)
+                self._news.notify_all()
             if changed:
-                changed(who, alive)
+                changed(member, alive)
             if not alive:
-                put((who, None))
+                put((member, None))
 
-        everyone = self.keys.alive("*")
+        everyone = self.keys.alive("**")
         self._kept.append(self._session.liveliness().declare_subscriber(everyone, _at_once(seen), history=True))
 
-    def alive(self, who: str) -> bool:
+    def alive(self, member: Member) -> bool:
         """Whether a directly linked process has announced itself and not gone since."""
-        return self._births[who] > self._deaths[who]
+        return member in self._here
 
-    def await_birth(self, who: str, number: int, timeout: float) -> bool:
-        """Wait for the ``number``-th process of this name (those before it may have gone unseen); is it there?
+    def await_birth(self, member: Member, timeout: float) -> bool:
+        """Wait until this process has announced itself; is it there?"""
+        with self._news:
+            self._news.wait_for(lambda: member in self._seen, timeout)
+            return self.alive(member)
 
-        A process announces itself after it has declared what it hears: from then on what we send reaches it.
-        """
-        with self._seen:
-            self._seen.wait_for(lambda: self._births[who] >= number, timeout)
-            return self.alive(who)
+    def await_somebody(self, who: str, timeout: float) -> Member | None:
+        """Wait until a process of this name is there; the newest."""
+        with self._news:
+            self._news.wait_for(lambda: any(m.who == who for m in self._here), timeout)
+            return max((m for m in self._here if m.who == who), default=None)
 
     # -- the start barrier ------------------------------------------------------------------------------------------
 
@@ -265,9 +284,8 @@ class Mesh:
         """
         while True:
             source, data = self._queue.get(timeout=timeout)
-            if isinstance(source, str):
-                for s in self.sources:
-                    s.gone = s.gone or s.who == source
+            if isinstance(source, Member):
+                self.bury(source)
                 return None
             try:
                 frame = source.decode(data)  # type: ignore[arg-type]
@@ -279,11 +297,16 @@ class Mesh:
 
     def wake(self) -> None:
         """Make a waiting ``get`` return None; safe in a signal handler."""
-        self._queue.put(("", None))
+        self._queue.put((Member(""), None))
 
     def pending(self) -> bool:
         """Whether ``get`` would return at once."""
         return not self._queue.empty()
+
+    def bury(self, member: Member) -> None:
+        """Nothing will come any more from this process."""
+        for s in self.sources:
+            s.gone = s.gone or (s.who, s.before) == member
 
     def reject(self, source: Source, cause: str) -> None:
         """Count a refused frame; the first of its kind is worth a line in the log."""

@@ -15,7 +15,7 @@ AWAY = 10  # steps (blocks of run.batch) that a restarted node is away when the 
 
 
 def read_faults(written: Any, graph: model.Graph | None, run: Mapping[str, Any], problems: Problems) -> Faults:
-    """The faults, by the ``run``'s settings: its seed, for when they have none of their own, and what to do about a loss.
+    """The faults, by the settings of ``run``: its seed, when they have none of their own, and what to do about a loss.
 
     Rules are numbered in the order of the file, links before cuts: the number is part of the key of a rule's draws.
     """
