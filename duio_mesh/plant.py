@@ -75,6 +75,9 @@ class Credits:
             try:
                 self._take(soon(self._spec.deadline))
                 heard = time.monotonic()
+                if said:
+                    said = False
+                    self._report("moving")
             except Empty:
                 who = [self._sources[i].who for i in late]
                 if time.monotonic() - heard > self._deadline:

@@ -1,8 +1,8 @@
 """A node's rounds with its neighbours when messages can be missing.
 
 Because faults are made on purpose (``duio_mesh.faults``). Every frame is really sent: the sender flips the bits that
-are to be flipped and sends twice what is to come twice; which frames are lost or late the receiver decides, and it never
-waits for one that the model keeps from it. Or because a neighbour is gone: then its edge is left out until it
+are to be flipped and sends twice what is to come twice; which frames are lost or late the receiver decides, and it
+never waits for one that the model keeps from it. Or because a neighbour is gone: then its edge is left out until it
 comes back.
 """
 

@@ -212,6 +212,12 @@ class Mesh:
         self._kept.append(self._session.liveliness().declare_token(self.keys.alive(self.who, self._before)))
         put, start = self._queue.put, len(self.keys.alive(""))
 
+        def tell(member: Member, alive: bool) -> None:
+            if changed:
+                changed(member, alive)
+            if not alive:
+                put((member, None))
+
         def seen(sample: Any) -> None:
             who, _, before = str(sample.key_expr)[start:].partition("/")
             member, alive = Member(who, int(before or 0)), sample.kind == zenoh.SampleKind.PUT
@@ -222,10 +228,12 @@ class Mesh:
                 else:
                     self._here.discard(member)
                 self._news.notify_all()
-            if changed:
-                changed(member, alive)
-            if not alive:
-                put((member, None))
+            if alive:
+                tell(member, True)
+                if member.before:  # the one before it is dead, though we may never have seen it announced
+                    tell(Member(who, member.before - 1), False)
+            else:
+                tell(member, False)
 
         everyone = self.keys.alive("**")
         self._kept.append(self._session.liveliness().declare_subscriber(everyone, _at_once(seen), history=True))
@@ -304,9 +312,9 @@ class Mesh:
         return not self._queue.empty()
 
     def bury(self, member: Member) -> None:
-        """Nothing will come any more from this process."""
+        """Nothing will come any more from this process, or from one before it."""
         for s in self.sources:
-            s.gone = s.gone or (s.who, s.before) == member
+            s.gone = s.gone or (s.who == member.who and s.before <= member.before)
 
     def reject(self, source: Source, cause: str) -> None:
         """Count a refused frame; the first of its kind is worth a line in the log."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import linalg
@@ -33,6 +33,7 @@ def node_spec(
 ) -> NodeSpec:
     """The spec of node i with these matrices (made C-contiguous), before it has an endpoint."""
     node, run = scenario.nodes[i], scenario.run
+    flow = flow_control(run, run.window)
     return NodeSpec(
         id=i,
         method=scenario.method,
@@ -45,9 +46,9 @@ def node_spec(
         tells=scenario.graph.tells(i),
         steps=run.steps,
         deadline=run.deadline,
-        window=_window(run),
-        credit=_quarter(run),
-        block=_quarter(run),
+        window=flow.window,
+        credit=flow.quarter,
+        block=flow.quarter,
         batch=run.batch,
         faults=scenario.faults.into(i, () if run.on_node_loss == "stop" else scenario.graph.hears(i)),
         spoils=scenario.faults.spoilt_by(i),
@@ -59,17 +60,17 @@ def node_spec(
     )
 
 
-def _window(run: Run) -> int:
-    """Steps that the plant may be ahead: at least two batches, or a node could not fill one while it fuses another."""
-    return max(run.window, 2 * run.batch)
+class Flow(NamedTuple):
+    """How far the plant may be ahead."""
+
+    window: int  # steps: at least two batches, or a node could not fill one while it fuses another
+    quarter: int  # steps between two words from node to plant, and in one frame from plant to node: keeps both busy
 
 
-def _quarter(run: Run) -> int:
-    """Steps between two words from node to plant, and in one frame from plant to node: few enough to keep both busy.
-
-    Whole batches, because a node that comes back does so between two blocks.
-    """
-    return max(1, _window(run) // 4 // run.batch) * run.batch
+def flow_control(run: Run, window: int) -> Flow:
+    """The flow control for a window of so many steps; whole batches, between which a node can come back."""
+    window = max(window, 2 * run.batch)
+    return Flow(window, max(1, window // 4 // run.batch) * run.batch)
 
 
 def plant_spec(scenario: Scenario) -> PlantSpec:
@@ -78,6 +79,7 @@ def plant_spec(scenario: Scenario) -> PlantSpec:
     Raises DesignError when no LQR gain exists, or when signals switch too often to be propagated exactly.
     """
     plant, run = scenario.plant, scenario.run
+    flow = flow_control(run, run.window)
     sensors = []
     for i, node in scenario.nodes.items():
         known = tuple(j for j, name in enumerate(plant.inputs) if name in set(node.knows))
@@ -104,8 +106,8 @@ def plant_spec(scenario: Scenario) -> PlantSpec:
         sensors=tuple(sensors),
         seed=run.seed,
         steps=run.steps,
-        window=_window(run),
-        block=_quarter(run),
+        window=flow.window,
+        block=flow.quarter,
         deadline=run.deadline,
         on_loss=run.on_node_loss,
         returns=scenario.faults.returns(),

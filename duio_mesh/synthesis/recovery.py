@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 
 from duio_mesh.errors import DesignError
+from duio_mesh.observers import make_observer
 from duio_mesh.synthesis.contingency import Cases
-from duio_mesh.synthesis.design import Design, Progress
+from duio_mesh.synthesis.design import Design, Progress, flow_control
 from duio_mesh.synthesis.losses import Loss
 
 SETTLED = 1e-3
@@ -38,7 +39,23 @@ def with_recovery(design: Design, progress: Progress = lambda _: None) -> Design
         i: replace(spec, settling=settling, excuses=tuple(j for j in spec.hears if _allows(found[j], i, enough)))
         for i, spec in design.nodes.items()
     }
-    return replace(design, nodes=nodes, certificate={**design.certificate, "node_loss": found})
+    certificate = {**design.certificate, "node_loss": found}
+    return _in_reach(replace(design, nodes=nodes, certificate=certificate))
+
+
+def _in_reach(design: Design) -> Design:
+    """The design with a window in rounds rather than steps: a node comes back where the plant is by then."""
+    run, spec = design.scenario.run, next(iter(design.nodes.values()))
+    rounds = make_observer(spec).rounds
+    flow = flow_control(run, run.window // rounds)
+    return replace(
+        design,
+        plant=replace(design.plant, window=flow.window, block=flow.quarter),
+        nodes={
+            i: replace(node, window=flow.window, credit=flow.quarter, block=flow.quarter)
+            for i, node in design.nodes.items()
+        },
+    )
 
 
 def _settling(design: Design) -> int:
