@@ -33,6 +33,7 @@ examples:
   python launch.py topologies/ring.yaml --steps 2000 --seed 7 --plot
   python launch.py topologies/ring.yaml --set plant.noise.variance=0 --set graph.edges='[[1,2],[3,4]]'
   python launch.py topologies/six_state_ring.yaml --check
+  python launch.py replay runs/heat-ring/latest --node 3   (one node again, alone, from its inputs; replay --help)
   python launch.py new heat --rooms 8x8 --nodes 16 --out topologies/heat8x8.yaml   (new --help: write a topology file)
 """
 
@@ -62,6 +63,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--live", action="store_true", help="also serve the recording to a Rerun viewer on this host")
     p.add_argument("--plot", action="store_true", help="write PNG figures of the errors and states into the results")
     p.add_argument("--no-record", action="store_true", help="no recorder process, no recording.rrd")
+    p.add_argument("--inputs", action="store_true", help="keep each node's inputs, for `replay` (docs/replay.md)")
     p.add_argument(
         "--set",
         action="append",
@@ -81,6 +83,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         from duio_mesh.generate import command
 
         return command.main(argv[1:])
+    if list(argv[:1]) == ["replay"]:
+        from duio_mesh import replay
+
+        return replay.main(argv[1:])
     args = parser().parse_args(argv)
     if args.contingency is not None and not args.check:
         parser().error("--contingency says what a design is worth on other graphs: use it with --check")
@@ -107,7 +113,7 @@ def _main(args: argparse.Namespace) -> int:
     from duio_mesh import synthesis
     from duio_mesh.scenario import load_scenario
 
-    flags = {"run.steps": args.steps, "run.seed": args.seed}
+    flags = {"run.steps": args.steps, "run.seed": args.seed, "run.inputs": "true" if args.inputs else None}
     overrides = args.overrides + [f"{path}={value}" for path, value in flags.items() if value is not None]
     scenario = load_scenario(args.topology, overrides, options_of=synthesis.options_of)
     if args.out and args.out.exists() and (not args.out.is_dir() or any(args.out.iterdir())):

@@ -101,7 +101,8 @@ class Launch:
         }
         for i, spec in design.nodes.items():
             who = f"node-{i}"
-            specs[who] = replace(spec, wire=wires[who], output=str(folder.rows(who)))
+            inputs = str(folder.inputs(who)) if design.scenario.run.inputs else ""
+            specs[who] = replace(spec, wire=wires[who], output=str(folder.rows(who)), inputs=inputs)
         if self._record:
             specs["recorder"] = RecorderSpec(
                 name=design.scenario.name,

@@ -31,13 +31,13 @@ from duio_mesh.spec import NodeSpec
 
 NO_VECTOR = np.zeros(0)
 BEAT = 0.5  # seconds between signs of life inside a step
+from duio_mesh.tape import taped
 
 
 def run(spec: NodeSpec, report: Report) -> None:
     """Run one node for ``spec.steps`` steps. Raises RunError when a neighbour or the plant is lost or late."""
-    observer = make_observer(spec)
-    row = sum(part.size for part in observer.estimate())
-    with Mesh(spec.wire, f"node-{spec.id}", report.warn) as mesh:
+    with taped(make_observer(spec), spec) as observer, Mesh(spec.wire, f"node-{spec.id}", report.warn) as mesh:
+        row = sum(part.size for part in observer.estimate())
         links = Links(spec, mesh, observer)
         mesh.watch(links.lockstep.noticed)
         mesh.meet()

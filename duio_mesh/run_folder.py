@@ -4,6 +4,7 @@ scenario.yaml  certificate.json  trace.npz  recording.rrd  metrics.json     writ
 nodes/node-3.spec  nodes/plant.spec  nodes/recorder.spec                    what each process was given (mode 0600)
 logs/node-3.jsonl  logs/node-3.err                                          events; whatever went to stderr
 rows/node-3.f64    rows/plant.f64    rows/node-3.f64.aside                  removed once trace.npz holds them
+inputs/node-3.tape                                                          when asked for: see tape.py (mode 0600)
 keys/node-3/key.pem  ...                                                    removed at the end (mode 0600 until then)
 """
 
@@ -64,6 +65,10 @@ class RunFolder:
     def rows(self, who: str) -> Path:
         """The journal of a process."""
         return self.root / "rows" / f"{who}.f64"
+
+    def inputs(self, who: str) -> Path:
+        """The tape of a node."""
+        return self.root / "inputs" / f"{who}.tape"
 
     def log(self, who: str, kind: str) -> Path:
         """The log (kind ``jsonl``) or standard error (``err``) of a process."""

@@ -80,6 +80,7 @@ class NodeSpec:
     wire: Wire = UNWIRED
 
 
+    inputs: str = ""  # file of everything that the observer is given (duio_mesh.tape); "" keeps none
 @dataclasses.dataclass(frozen=True)
 class SensorSpec:
     """What the plant needs to measure for one node: y_i = C_i x + F_i v_i, u_i = u[known]."""
@@ -171,7 +172,7 @@ def _load(data: bytes) -> Any:
 
 def write_spec(spec: NodeSpec | PlantSpec | RecorderSpec, path: Path) -> None:
     """Write ``spec`` readable by its owner only (mode 0600)."""
-    data = msgpack.packb(spec, default=_pack)
+    data = packed(spec)
     with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "wb") as f:
         f.write(data)
 
@@ -188,3 +189,9 @@ def read_spec(path: Path, kind: type[Spec]) -> Spec:
     if not isinstance(spec, kind):
         raise ValueError(f"{path} holds a {type(spec).__name__}, not a {kind.__name__}")
     return spec
+def packed(value: Any) -> bytes:
+    """Any part of a spec as msgpack. Raises TypeError for what a spec cannot hold."""
+    data: bytes = msgpack.packb(value, default=_pack)
+    return data
+
+

@@ -28,12 +28,13 @@ FLOORS = [
         "observers",
         "mesh",
         "journal",
+        "tape",
     ],
     ["report", "process"],
     ["synthesis", "simulation", "node", "plant", "recorder"],
     ["nursery", "supervisor", "run_folder", "schema", "credentials", "wiring"],
     ["launcher"],
-    ["api", "console", "generate"],
+    ["api", "console", "generate", "replay"],
     ["cli"],
 ]
 OUTSIDE = {  # what a room may import from outside the standard library
@@ -42,6 +43,7 @@ OUTSIDE = {  # what a room may import from outside the standard library
     "mesh": {"numpy", "zenoh", "msgpack"},
     "dynamics": {"numpy"},
     "faults": set(),
+    "tape": {"numpy", "msgpack"},
     "node": {"numpy"},
     "scenario": {"numpy", "pydantic", "pydantic_core", "ruamel"},
 }

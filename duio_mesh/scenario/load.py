@@ -140,4 +140,4 @@ def _run(run: dict[str, Any], numbers: int, problems: Problems) -> model.Run | N
     if not schema.Run.model_fields.keys() <= run.keys():
         return None
     verdict = model.Convergence(**run["convergence"].model_dump())
-    return model.Run(run["steps"], run["seed"], verdict, run["deadline"], run["window"], run["batch"])
+    return model.Run(run["steps"], run["seed"], verdict, run["deadline"], run["window"], run["batch"], run["inputs"])

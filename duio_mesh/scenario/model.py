@@ -152,6 +152,7 @@ class Run:
     deadline: float  # seconds a process waits for a message before the run fails
     window: int  # steps that the plant may be ahead of the slowest node
     batch: int = 1  # steps whose fusion travels as one block; estimates then come that many steps late
+    inputs: bool = False  # every node keeps a tape of what its observer is given
 
 
 class Security(NamedTuple):

@@ -219,6 +219,7 @@ class Run(Strict):
     batch: Annotated[
         int, Field(ge=1, le=10_000, description="steps fused as one block (admm only); estimates come so much late")
     ] = 1
+    inputs: Annotated[bool, Field(description="every node keeps a tape of its inputs, to be replayed alone")] = False
 
 
 class GilbertElliott(Strict):
