@@ -231,7 +231,7 @@ def run_in_process(
 
 def _flagged(design: Design, flags: Mapping[int, int], counts: dict[str, Any]) -> tuple[str, ...]:
     """Under faults, count the estimates that their own nodes mark and warn of them: the verdict does not see them."""
-    if not design.scenario.faults.links:
+    if not design.scenario.patchy:
         return ()
     counts["flagged"] = {str(i): flags.get(i, 0) for i in design.nodes}
     steps = design.scenario.run.steps
@@ -274,7 +274,7 @@ def gather(folder: RunFolder, design: Design, supervisor: Supervisor, seconds: f
     warnings = [f"{p.who}: {text}" for p in supervisor.processes.values() for text in p.warnings]
     flags = {i: said[f"node-{i}"]["flagged"] for i in design.nodes if said.get(f"node-{i}")}
     warnings += _flagged(design, flags, counts)
-    if design.scenario.faults.links:
+    if design.scenario.patchy:
         counts["faults"] = {what: sum(node["faults"].get(what, 0) for node in nodes) for what in COUNTED}
     lost = recorder is not None and not recorder.done
     if recorder and lost:

@@ -8,7 +8,8 @@ the estimate of x(k).
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from itertools import chain
 from math import isfinite
@@ -18,10 +19,12 @@ import numpy as np
 
 from duio_mesh.arrays import Array
 from duio_mesh.errors import RunError
-from duio_mesh.journal import Journal
+from duio_mesh.journal import MISSING, Journal, missing
 from duio_mesh.mesh import Mesh
 from duio_mesh.mesh.faulty import LONG_WAY, Arrived, FaultyExchange
 from duio_mesh.mesh.lockstep import Exchange, Line, Lockstep
+from duio_mesh.mesh.realtime import Realtime
+from duio_mesh.mesh.session import Ready
 from duio_mesh.observers import Observer, make_observer
 from duio_mesh.observers.absence import Late, flagged, take_late
 from duio_mesh.observers.base import reader
@@ -42,9 +45,10 @@ def run(spec: NodeSpec, report: Report) -> None:
         mesh.watch(links.lockstep.noticed)
         mesh.meet()
         report("ready")
-        with links.lockstep, Journal(spec.output, row, links.trace) as journal:
+        with links.gaps, links.lockstep, Journal(spec.output, row, links.trace) as journal:
             figures = live(spec, observer, links, journal, report)
-    report("done", **figures, frames=links.told.frames, rejected=mesh.rejections(), faults=links.faults())
+    counts = {"frames": links.told.frames, "rejected": mesh.rejections(), "faults": links.faults()}
+    report("done", **figures, **counts, timing=links.timing())
 
 
 class Links:
@@ -53,21 +57,35 @@ class Links:
     def __init__(self, spec: NodeSpec, mesh: Mesh, observer: Observer) -> None:
         i, keys, window = spec.id, mesh.keys, spec.window
         room = LONG_WAY if spec.without else 0
-        self.lockstep = Lockstep(mesh, spec.deadline)
-        self.plant = Line(mesh, keys.plant(i), f"plant -> {i}", "plant", ("plant", i), window)
+        edges: list[tuple[str, str, Ready | None]] = [(keys.edge(i, j), f"edge {i} -> {j}", (i, j)) for j in spec.tells]
+        self.told = mesh.speak(edges, drop=spec.tick > 0)  # in real time nobody waits for who does not listen
+        self.credit = mesh.speak([(keys.credit(i), f"{i} -> plant", (i, "plant"))])
+        self.trace = mesh.speak([(keys.trace(i), f"{i} -> recorder", None)], drop=True)
+        self.exchange: Exchange | FaultyExchange | Realtime
+        self.lockstep: Lockstep | Realtime
+        self.gaps: AbstractContextManager[object] = nullcontext()
+        late = partial(_hand_over, observer)
+        if spec.tick:
+            self.gaps = gaps = Journal(str(missing(spec.output)) if spec.output else "", 1, self.trace, MISSING)
+            self.lockstep = self.exchange = clock = Realtime(spec, mesh, self.told, late, gaps.add)
+            self.sample: Callable[[int, int, int], Array] = clock.sample
+            return
+        self.lockstep = lockstep = Lockstep(mesh, spec.deadline)
+        self.sample = partial(lockstep.take, Line(mesh, keys.plant(i), f"plant -> {i}", "plant", ("plant", i), window))
         heard = {
             j: Line(mesh, keys.edge(j, i), f"edge {j} -> {i}", f"node-{j}", (j, i), window, room) for j in spec.hears
         }
-        self.told = mesh.speak([(keys.edge(i, j), f"edge {i} -> {j}", (i, j)) for j in spec.tells])
-        self.credit = mesh.speak([(keys.credit(i), f"{i} -> plant", (i, "plant"))])
-        self.trace = mesh.speak([(keys.trace(i), f"{i} -> recorder", None)], drop=True)
-        self.exchange: Exchange | FaultyExchange = Exchange(self.lockstep, self.told, heard)
+        self.exchange = Exchange(lockstep, self.told, heard)
         if spec.without:  # faults are made on purpose
-            self.exchange = FaultyExchange(spec, self.lockstep, self.told, heard, partial(_hand_over, observer))
+            self.exchange = FaultyExchange(spec, lockstep, self.told, heard, late)
 
     def faults(self) -> dict[str, int]:
         """How many frames met which fault."""
-        return dict(self.exchange.counts) if isinstance(self.exchange, FaultyExchange) else {}
+        return {} if isinstance(self.exchange, Exchange) else dict(self.exchange.counts)
+
+    def timing(self) -> dict[str, int]:
+        """In real time: how many messages were in time, late and missing, and how many steps took too long."""
+        return self.exchange.timing() if isinstance(self.exchange, Realtime) else {}
 
 
 def live(spec: NodeSpec, observer: Observer, links: Links, journal: Journal, report: Report) -> dict[str, Any]:
@@ -109,7 +127,7 @@ def _samples(links: Links, spec: NodeSpec) -> Iterator[Array]:
     size = spec.p + spec.m
     for k in range(0, spec.steps, spec.block):
         count = min(spec.block, spec.steps - k)
-        yield from links.lockstep.take(links.plant, k, 0, count * size).reshape(count, size)
+        yield from links.sample(k, 0, count * size).reshape(count, size)
 
 
 def _hand_over(observer: Observer, k: int, arrived: Sequence[Arrived]) -> None:

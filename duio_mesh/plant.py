@@ -7,6 +7,7 @@ The truth goes to the plant's own file and to the recorder, never to a node.
 from __future__ import annotations
 
 import time
+from contextlib import suppress
 from queue import Empty
 
 import numpy as np
@@ -16,6 +17,7 @@ from duio_mesh.dynamics import Plant
 from duio_mesh.errors import RunError
 from duio_mesh.journal import Journal
 from duio_mesh.mesh import Mesh, Source
+from duio_mesh.mesh.pace import Pace
 from duio_mesh.process import Report, main
 from duio_mesh.spec import PlantSpec
 
@@ -56,8 +58,17 @@ class Credits:
                     f"the plant waited {self._spec.deadline:g} s for {who} to finish step {steps - 1}"
                 ) from None
 
-    def _take(self) -> None:
-        if got := self._mesh.get(self._spec.deadline):
+    def listen(self, seconds: float) -> None:
+        """Take the next word of a node, if there is one within so many seconds."""
+        with suppress(Empty):
+            self._take(seconds)
+
+    def behind(self, steps: int) -> list[str]:
+        """The nodes that have not finished so many steps, and where they are."""
+        return [f"{s.who} (at step {done})" for s, done in self._done.items() if done < steps]
+
+    def _take(self, seconds: float | None = None) -> None:
+        if got := self._mesh.get(self._spec.deadline if seconds is None else seconds):
             source, frame = got
             self._done[source] = max(self._done[source], min(frame.k, self._spec.steps))
 
@@ -76,11 +87,13 @@ def run(spec: PlantSpec, report: Report) -> None:
             report.warn(f"the recorder was not there after {RECORDER:g} s; starting without it")
         report("ready")
         credits, begin, cpu = Credits(mesh, nodes, spec), time.monotonic(), time.process_time()
+        pace = Pace(spec, credits)
         with Journal(spec.output, plant.x.size, truth) as journal:
             for k in range(0, spec.steps, spec.block):
                 block = range(k, min(k + spec.block, spec.steps))
                 credits.collect()
                 credits.wait(block.stop - spec.window)
+                pace.until(k)
                 rows: dict[int, list[Array]] = {i: [] for i in ids}
                 for _ in block:
                     for i, data in plant.sample().items():
@@ -99,6 +112,7 @@ def run(spec: PlantSpec, report: Report) -> None:
             cpu_seconds=time.process_time() - cpu,
             frames=frames,
             rejected=mesh.rejections(),
+            timing=pace.said,
         )
 
 

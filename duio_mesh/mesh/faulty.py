@@ -6,14 +6,15 @@ which frames are lost or late the receiver decides, and it never waits for one t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import zenoh
 
 from duio_mesh.arrays import Array
-from duio_mesh.faults import Edge, Reception, Stamp
+from duio_mesh.faults import Reception, Stamp
 from duio_mesh.mesh.lockstep import Line, Lockstep
 from duio_mesh.mesh.session import Outlet
+from duio_mesh.mesh.spoiler import Spoiler
 from duio_mesh.spec import NodeSpec
 
 LONG_WAY = 1_000_000
@@ -35,12 +36,10 @@ class FaultyExchange:
         late: Callable[[int, Sequence[Arrived]], None],
     ) -> None:
         """``late`` is called as late(k, [(stamp, vector), ...]) before the round in which older frames arrive."""
-        self._lockstep, self._told, self._late = lockstep, told, late
+        self._lockstep, self._tell, self._late = lockstep, Spoiler(spec, told), late
         self._heard = dict(sorted(heard.items()))
         self._reception = Reception(spec.faults, spec.hears)
         self._sizes: dict[Stamp, int] = {}  # of frames on their long way
-        seed = spec.faults.seed
-        self._out = [Edge(seed, spec.id, j, spec.spoils[j]) if j in spec.spoils else None for j in spec.tells]
 
     @property
     def counts(self) -> Mapping[str, int]:
@@ -49,7 +48,7 @@ class FaultyExchange:
 
     def __call__(self, k: int, r: int, vector: Array) -> dict[int, Array]:
         """Send our vector of step k, round r; those of the same round that arrive in time, in ascending order of id."""
-        self._told.send_each(k, r, vector, lambda at, frame: self._spoilt(at, frame, k, r))
+        self._tell(k, r, vector)
         on_time, held, lost, late = self._reception.next(k, r)
         take, size = self._lockstep.take, vector.size
         for j in held:
@@ -77,15 +76,3 @@ class FaultyExchange:
             if sample is None:
                 return
             self._lockstep.set_aside(line, sample.payload.to_bytes(), k, r)
-
-    def _spoilt(self, at: int, frame: bytes, k: int, r: int) -> Iterable[bytes]:
-        edge = self._out[at]
-        if edge is None:
-            return (frame,)
-        fate = edge.fate(k, r)
-        if fate.corrupt:
-            flipped = bytearray(frame)
-            bit = int(fate.bit * 8 * len(frame))
-            flipped[bit // 8] ^= 1 << bit % 8
-            frame = bytes(flipped)
-        return (frame, frame) if fate.duplicate else (frame,)

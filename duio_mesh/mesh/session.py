@@ -232,8 +232,9 @@ class Mesh:
         Bad frames are counted at their source, warned about once per cause, and dropped. Raises ``queue.Empty`` when
         nothing came for ``timeout`` seconds.
         """
+        end = time.monotonic() + timeout  # bad frames do not put it off
         while True:
-            source, data = self._queue.get(timeout=timeout)
+            source, data = self._queue.get(timeout=max(0.0, end - time.monotonic()))
             if isinstance(source, str):
                 for s in self.sources:
                     s.gone = s.gone or s.who == source

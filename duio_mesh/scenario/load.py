@@ -17,6 +17,7 @@ from duio_mesh.scenario.overrides import apply_override
 from duio_mesh.scenario.plant import PLANT, PlantParts, read_plant
 from duio_mesh.scenario.problems import Problems, did_you_mean, listed
 from duio_mesh.scenario.source import read_file
+from duio_mesh.scenario.timing import read_timing
 from duio_mesh.scenario.validate import describe, fields, whole
 
 OptionsOf = Callable[[str], type[BaseModel]]
@@ -69,6 +70,7 @@ def _scenario(document: dict[str, Any], problems: Problems, options_of: OptionsO
     settings = _run(run, len(nodes or ()) * (parts.states.number if parts.states else 0), problems)
     faults = read_faults(document.get("faults"), graph, run.get("seed", 0), problems)
     security = _security(document, problems)
+    timing = read_timing(document, parts.plant, run, problems)
     if problems or parts.plant is None or nodes is None or graph is None or settings is None:
         return None
     resolved = copy.deepcopy(document)
@@ -86,6 +88,7 @@ def _scenario(document: dict[str, Any], problems: Problems, options_of: OptionsO
         resolved,
         faults,
         security,
+        timing,
     )
 
 

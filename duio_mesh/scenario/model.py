@@ -13,6 +13,7 @@ import numpy as np
 
 from duio_mesh.arrays import Array
 from duio_mesh.faults import NO_FAULTS, Faults
+from duio_mesh.spec import Outside
 
 Signal: TypeAlias = tuple[Mapping[str, Mapping[str, float]], ...]
 """A sum of terms, each ``{kind: parameters}``; ``duio_mesh.dynamics.signal`` evaluates it. () is zero."""
@@ -155,6 +156,17 @@ class Run:
     inputs: bool = False  # every node keeps a tape of what its observer is given
 
 
+class Timing(NamedTuple):
+    """When steps happen."""
+
+    mode: Literal["lockstep", "realtime"] = "lockstep"
+    tick: float = 0.0  # wall seconds per step; 0: as long as it takes
+    wait: float = 0.0  # seconds from a sample's arrival in which a node waits for its neighbours
+
+
+LOCKSTEP = Timing()
+
+
 class Security(NamedTuple):
     """Who may speak to the processes of a run (docs/security.md)."""
 
@@ -181,6 +193,13 @@ class Scenario:
     document: Mapping[str, Any] = field(repr=False)  # the resolved file as plain data: what scenario.yaml is made of
     faults: Faults = NO_FAULTS
     security: Security = OPEN
+    outside: Outside | None = None  # the measurements come from outside: nobody knows the true state
+    timing: Timing = LOCKSTEP
+
+    @property
+    def patchy(self) -> bool:
+        """Whether messages can be missing, so that observers need to know what to do without them."""
+        return bool(self.faults.links) or self.timing.mode == "realtime"
 
     def known(self, i: int) -> Array:
         """B_i (n, m_i): columns of B whose inputs node i is told, in the order of ``plant.inputs``."""

@@ -111,7 +111,7 @@ def _spec(scenario: Scenario, i: int, local: Local, island: Island) -> NodeSpec:
     if options.fusion == "finite_time" or options.setup == "distributed":
         given |= {"island_size": len(island.ids), "eigenvalues": spectrum(island.L)}
     predicts = options.without == "predict" or (options.without == "auto" and options.fusion == "finite_time")
-    if scenario.faults.links and predicts:
+    if scenario.patchy and predicts:
         matrices |= {"A": scenario.plant.A, "B": scenario.known(i)}
     return node_spec(scenario, i, matrices, given)
 

@@ -51,7 +51,7 @@ def node_spec(
         batch=run.batch,
         faults=scenario.faults.into(i),
         spoils=scenario.faults.spoilt_by(i),
-        without=scenario.options.without if scenario.faults.links else "",
+        without=scenario.options.without if scenario.patchy else "",
     )
 
 
