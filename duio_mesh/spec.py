@@ -39,11 +39,6 @@ class Guard:
     tells: tuple[str, ...]  # processes to which it has something to tell
     dials: tuple[str, ...]  # processes that it connects to; the others connect to it
     limit: int  # bytes of the largest payload that it accepts
-    through: str = ""  # the router behind which all others are; "" where they are linked directly
-    probed: bool = False  # a health probe, with this process' own credentials, may ask whether it is alive
-    behind: Mapping[str, tuple[str, ...]] = dataclasses.field(default_factory=dict)
-    """Of a router: direct neighbour -> the processes that are reached through it."""
-    pairs: tuple[tuple[str, str], ...] = ()  # of a router: (source, target) of all that passes it
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,8 +49,6 @@ class Wire:
     listen: tuple[str, ...]  # Zenoh endpoints, e.g. tcp/127.0.0.1:7447
     connect: tuple[str, ...]
     guard: Guard | None = None  # None: whoever reaches a port may speak
-    mode: str = "peer"  # peer | client (of a router) | router
-    start: float = START  # seconds for all processes of a run to find each other
 
 
 UNWIRED = Wire("", (), ())
@@ -118,6 +111,8 @@ class PlantSpec:
     window: int  # steps it may be ahead of the slowest node
     block: int  # steps whose samples travel in one frame
     deadline: float
+    tick: float = 0.0  # wall seconds per step; 0: as fast as the slowest node
+    wait: float = 0.0  # least seconds between two samples when it is behind the wall clock
     recorded: bool = False  # there is a recorder to wait for, a little
     output: str = ""  # file of the true state, float64 rows
     wire: Wire = UNWIRED
@@ -135,8 +130,6 @@ class RecorderSpec:
     steps: int
     recording: str  # path of recording.rrd
     live: bool
-    tick: float = 0.0  # wall seconds per step; 0: as fast as the slowest node
-    wait: float = 0.0  # least seconds between two samples when it is behind the wall clock
     description: str  # markdown for the recording's first tab
     truth: str  # the plant's output file and ...
     estimates: Mapping[int, str]  # ... the nodes': rows that never arrived are read from here at the end
@@ -145,17 +138,7 @@ class RecorderSpec:
     wire: Wire = UNWIRED
 
 
-@dataclasses.dataclass(frozen=True)
-class RouterSpec:
-    """The router process of one host: it carries what processes of hosts that cannot reach each other say."""
-
-    who: str  # router-<host>
-    carries: tuple[str, ...]  # all processes of the run; once they have come and gone, so does the router
-    wire: Wire = UNWIRED
-
-
-AnySpec: TypeAlias = NodeSpec | PlantSpec | RecorderSpec | RouterSpec
-Spec = TypeVar("Spec", NodeSpec, PlantSpec, RecorderSpec, RouterSpec)
+Spec = TypeVar("Spec", NodeSpec, PlantSpec, RecorderSpec)
 
 _TYPES: dict[str, type[Any]] = {
     t.__name__: t for t in (Guard, Wire, Rule, Incoming, NodeSpec, SensorSpec, PlantSpec, RecorderSpec)
@@ -171,7 +154,6 @@ def _pack(value: Any) -> Any:
         fields = {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}
         return msgpack.ExtType(_RECORD, msgpack.packb([type(value).__name__, fields], default=_pack))
     if isinstance(value, Mapping):
-    kept: bool = False  # write all rows down as they come: their own journals are on other hosts
         return dict(value)
     if isinstance(value, np.generic):
         return value.item()
