@@ -13,7 +13,6 @@ import numpy as np
 
 from duio_mesh.arrays import Array
 from duio_mesh.faults import NO_FAULTS, Faults
-from duio_mesh.spec import Outside
 
 Signal: TypeAlias = tuple[Mapping[str, Mapping[str, float]], ...]
 """A sum of terms, each ``{kind: parameters}``; ``duio_mesh.dynamics.signal`` evaluates it. () is zero."""
@@ -193,7 +192,6 @@ class Scenario:
     document: Mapping[str, Any] = field(repr=False)  # the resolved file as plain data: what scenario.yaml is made of
     faults: Faults = NO_FAULTS
     security: Security = OPEN
-    outside: Outside | None = None  # the measurements come from outside: nobody knows the true state
     timing: Timing = LOCKSTEP
 
     @property
