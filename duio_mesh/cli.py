@@ -154,6 +154,7 @@ def _run(design: Design, args: argparse.Namespace, supervisor: Supervisor | None
     """Run the design as asked, with progress, and draw the figures."""
     from duio_mesh import console, launcher
 
+    console.clock(design, processes=supervisor is not None)
     with console.progress(design) as show:
         if supervisor is None:
             result = launcher.run_in_process(design, args.out, record=not args.no_record, show=show)

@@ -15,6 +15,7 @@ from rich.table import Table
 
 from duio_mesh import launcher
 from duio_mesh.launcher import RunResult
+from duio_mesh.report.timeliness import in_words
 from duio_mesh.synthesis.design import Design
 
 SLOW = 0.1  # of an error left by a step that starts afresh: the estimate is not worth its name
@@ -49,6 +50,12 @@ def progress(design: Design) -> Iterator[launcher.Show]:
             bar.update(task, completed=now.steps, rate=rate, errors=errors_in_words(now.errors))
 
         yield show
+
+
+def clock(design: Design, *, processes: bool) -> None:
+    """What a run on the wall clock is about to do, above all how long it will take."""
+    if words := in_words(design.scenario.timing, design.plant.steps, processes=processes):
+        _err.print(words, soft_wrap=True)
 
 
 def errors_in_words(errors: Mapping[int, float]) -> str:

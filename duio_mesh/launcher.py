@@ -22,6 +22,7 @@ from duio_mesh.errors import RunError
 from duio_mesh.faults import COUNTED
 from duio_mesh.report.description import describe
 from duio_mesh.report.metrics import metrics
+from duio_mesh.report.timeliness import timeliness, untimely
 from duio_mesh.report.trace_file import write_trace
 from duio_mesh.run_folder import RunFolder
 from duio_mesh.scenario.model import Scenario
@@ -276,6 +277,9 @@ def gather(folder: RunFolder, design: Design, supervisor: Supervisor, seconds: f
     warnings += _flagged(design, flags, counts)
     if design.scenario.patchy:
         counts["faults"] = {what: sum(node["faults"].get(what, 0) for node in nodes) for what in COUNTED}
+    if design.scenario.timing.tick:
+        counts["timing"] = timeliness(design.scenario, said)
+        warnings += untimely(counts["timing"], design.plant.steps)
     lost = recorder is not None and not recorder.done
     if recorder and lost:
         warnings.append(f"{recorder.death()}; the recording was made from the trace instead")
