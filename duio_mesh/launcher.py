@@ -119,6 +119,7 @@ class Launch:
                 estimates={i: str(folder.rows(f"node-{i}")) for i in ids},
                 unknown_inputs=reconstructs(design)[0],
                 watch_step=getattr(design.scenario.options, "watch_step", None),
+                tick=design.plant.tick,
                 wire=wires["recorder"],
             )
         return specs

@@ -11,7 +11,7 @@ import time
 from contextlib import suppress
 from queue import Empty, SimpleQueue
 
-from duio_mesh.journal import ASIDE, PERIOD, aside, map_rows
+from duio_mesh.journal import ASIDE, MISSING, PERIOD, aside, map_rows, missing
 from duio_mesh.mesh import Frame, Mesh, Source
 from duio_mesh.observers.watch import COLUMNS
 from duio_mesh.process import Report, main
@@ -63,7 +63,7 @@ def run(spec: RecorderSpec, report: Report) -> None:
             with suppress(Empty):
                 if got := mesh.get(PERIOD):
                     source, frame = got
-                    newest[source.who] = _keep(recording, spec, node_of[source], frame)
+                    newest[source.who] = max(newest[source.who], _keep(recording, spec, node_of[source], frame))
             while not changes.empty():
                 who, alive = changes.get()
                 if who in newest:
@@ -77,6 +77,7 @@ def run(spec: RecorderSpec, report: Report) -> None:
         )
         for i, path in spec.estimates.items():
             recording.rounds(i, map_rows(aside(path), COLUMNS))
+            recording.missing_neighbours(i, 0, map_rows(missing(path), 1)[:, 0])
     report("done", cpu_seconds=time.process_time(), rejected=mesh.rejections())
 
 
@@ -84,6 +85,9 @@ def _keep(recording: Recording, spec: RecorderSpec, node: int | None, frame: Fra
     """Hand one batch to the recording; the step after its last row."""
     if node is not None and frame.r == ASIDE:
         recording.rounds(node, frame.vector.reshape(-1, COLUMNS))
+        return frame.k
+    if node is not None and frame.r == MISSING:
+        recording.missing_neighbours(node, frame.k, frame.vector)
         return frame.k
     rows = frame.vector.reshape(-1, spec.n if node is None else spec.sizes[node])
     if node is None:

@@ -135,6 +135,7 @@ class RecorderSpec:
     estimates: Mapping[int, str]  # ... the nodes': rows that never arrived are read from here at the end
     unknown_inputs: int = 0  # of a row's columns after the n states, so many estimate w; the rest the node's own noise
     watch_step: int | None = None  # a step whose rounds the nodes tell one by one
+    tick: float = 0.0  # wall seconds per step, and nodes tell which neighbours were missing; 0 is lockstep
     wire: Wire = UNWIRED
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from duio_mesh.report.entities import DESCRIPTION, EVENTS, RATES, STATES, TRUTH, WATCHED, Entities, spread
+from duio_mesh.report.entities import DESCRIPTION, EVENTS, GAPS, RATES, STATES, TRUTH, WATCHED, Entities, spread
 from duio_mesh.report.topology import positions
 
 VIEWS = 12  # states that are shown side by side
@@ -42,7 +42,7 @@ def styles(entities: Entities, description: str) -> Iterator[tuple[str, Any]]:
         yield path, _line("truth", TRUTH, 4.0)
     for i in entities.ids:
         watched = [entities.rounds(kind, i) for kind in WATCHED if entities.spec.watch_step is not None]
-        for path in (entities.error(i), entities.rate(f"node-{i}"), *watched):
+        for path in (entities.error(i), entities.rate(f"node-{i}"), entities.gap(i), *watched):
             yield path, _line(f"node {i}", entities.colours[i], 1.5)
         for _, path in entities.estimates(i):
             name = path.rsplit("/", 1)[1] if path.startswith("/noise") else f"node {i}"
@@ -184,8 +184,11 @@ def _run(entities: Entities, rates: bool) -> rrb.Container:
     document = rrb.TextDocumentView(origin=DESCRIPTION, name="What was run")
     if not rates:
         return rrb.Horizontal(document, name="Run")
-    plot = _plot("Steps per second", [f"{RATES}/**"], legend=len(entities.ids) < LEGEND)
-    return rrb.Horizontal(plot, document, name="Run")
+    legend = len(entities.ids) < LEGEND
+    plots = [_plot("Steps per second", [f"{RATES}/**"], legend=legend)]
+    if entities.spec.tick:
+        plots.append(_plot("Neighbours that a node went on without", [f"{GAPS}/**"], legend=legend))
+    return rrb.Horizontal(rrb.Vertical(*plots), document, name="Run")
 
 
 def _plot(name: str, contents: list[str], *, legend: bool, axis: rrb.TimeAxis | None = None) -> rrb.View:

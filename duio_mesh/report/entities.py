@@ -16,7 +16,7 @@ ERROR_ROWS = 2_000_000  # error norms in a recording, all nodes together (about 
 STATE_VALUES = 4_000_000  # values of states, estimates and reconstructions (about 25 bytes each)
 SERIES = 640  # lines of states, estimates and reconstructions
 
-EVENTS, DESCRIPTION, RATES = "/events", "/description", "/rates"
+EVENTS, DESCRIPTION, RATES, GAPS = "/events", "/description", "/rates", "/missing"
 STATES = {"up": 0x3FB950FF, "unknown": 0x8B949EFF, "late": 0xD29922FF, "down": 0xF85149FF}
 """How a process or an edge can be, the better before the worse, and its colour (RGBA): green, grey, amber, red."""
 TRUTH = 0x9AA0A6FF
@@ -62,6 +62,10 @@ class Entities:
     def alive(self, who: str) -> str:
         """How a process is: ``who`` is its name, plant or node-3."""
         return f"/alive/{self._process(who)}"
+
+    def gap(self, i: int) -> str:
+        """How many neighbours the node went on without."""
+        return f"{GAPS}/{self.name(i)}"
 
     def rate(self, who: str) -> str:
         """Steps per second of a process."""

@@ -16,6 +16,7 @@ from duio_mesh.report import blueprint as look
 from duio_mesh.report.buffer import ROWS, Buffer
 from duio_mesh.report.conditions import Conditions
 from duio_mesh.report.entities import EVENTS, WATCHED, Column, Entities
+from duio_mesh.report.gaps import Gaps
 from duio_mesh.report.pairing import Decimator, Errors, Pairing, Span, Spans, log_norms, runs
 from duio_mesh.report.streams import Batch, FileStream, LiveStream, Opening
 from duio_mesh.spec import RecorderSpec
@@ -58,6 +59,7 @@ class Recording:
 
         self.event(f"{len(entities.ids)} nodes, {spec.n} states, {spec.steps} steps of {spec.step:g} s")
         self._conditions = Conditions(entities, self._send, self.event, self._reached)
+        self._gaps = Gaps(entities, self._scalars) if spec.tick else None
 
     @property
     def url(self) -> str | None:
@@ -122,6 +124,11 @@ class Recording:
         """Steps per second of processes (plant, node-3) at step k; about once a second is enough."""
         for who, value in values.items():
             self._send(self._entities.rate(who), [k], rr.Scalars.columns(scalars=[float(value)]))
+
+    def missing_neighbours(self, node: int, k: int, counts: Array) -> None:
+        """How many neighbours a node went on without in the steps from k on (m,), in a run on the wall clock."""
+        if self._gaps:
+            self._gaps.rows(node, k, counts)
 
     def flush(self) -> None:
         """Write what has gathered, where it is enough to be worth it. Call it as often as a viewer should see news.
@@ -230,7 +237,7 @@ class Recording:
                 self.estimates(source, k + first, part)
 
     def _buffers(self) -> list[Buffer]:
-        return [*self._errors.values(), *self._states.values()]
+        return [*self._errors.values(), *self._states.values(), *(self._gaps.buffers.values() if self._gaps else ())]
 
     def _scalars(self, path: str, steps: NDArray[np.int64], values: Array) -> None:
         self._send(path, steps, rr.Scalars.columns(scalars=values))
