@@ -42,7 +42,8 @@ def styles(entities: Entities, description: str) -> Iterator[tuple[str, Any]]:
         yield path, _line("truth", TRUTH, 4.0)
     for i in entities.ids:
         watched = [entities.rounds(kind, i) for kind in WATCHED if entities.spec.watch_step is not None]
-        for path in (entities.error(i), entities.rate(f"node-{i}"), entities.gap(i), *watched):
+        watched += [entities.gap(i)] if entities.spec.tick else []
+        for path in (entities.error(i), entities.rate(f"node-{i}"), *watched):
             yield path, _line(f"node {i}", entities.colours[i], 1.5)
         for _, path in entities.estimates(i):
             name = path.rsplit("/", 1)[1] if path.startswith("/noise") else f"node {i}"
