@@ -114,7 +114,7 @@ class _Ring:
 
     def __init__(self, window: int, n: int) -> None:
         self._steps = np.full(window, -1, dtype=np.int64)
-        self._rows = np.empty((window, n))
+        self._rows = np.full((window, n), np.nan)  # touched now: memory that is needed stays the same from here on
 
     def put(self, steps: NDArray[np.int64], rows: Array) -> None:
         slots = steps % len(self._steps)

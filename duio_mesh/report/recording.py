@@ -21,7 +21,8 @@ from duio_mesh.report.pairing import Decimator, Errors, Pairing, Span, Spans, lo
 from duio_mesh.report.streams import Batch, FileStream, LiveStream, Opening
 from duio_mesh.spec import RecorderSpec
 
-SENDS = 100  # of one series in a whole run: a viewer is behind by one percent of the plot's width at most
+SENDS = 20  # of one series in a whole run: each leaves some kB with Rerun until the file is closed ...
+LIVE_SENDS = 100  # ... where somebody may watch: a viewer is behind by one percent of the plot's width at most
 CHUNKS = 8_000  # sends of a whole run, all series: each costs 50 microseconds and 2 kB whatever is in it
 
 
@@ -52,9 +53,10 @@ class Recording:
         self._columns: dict[int | None, tuple[Column, ...]] = {None: entities.truth}
         self._columns |= {i: entities.estimates(i) for i in entities.ids}
         paths = {source: [path for _, path in columns] for source, columns in self._columns.items()}
-        enough = _enough(entities.error_rows, len(entities.ids), CHUNKS // 4)
+        most = LIVE_SENDS if spec.live else SENDS
+        enough = _enough(entities.error_rows, len(entities.ids), CHUNKS // 4, most)
         self._errors = {i: Buffer([entities.error(i)], enough, self._scalars) for i in entities.ids}
-        enough = _enough(entities.state_values, entities.series, CHUNKS * 3 // 4)
+        enough = _enough(entities.state_values, entities.series, CHUNKS * 3 // 4, most)
         self._states = {source: Buffer(paths[source], enough, self._scalars) for source in paths}
 
         self.event(f"{len(entities.ids)} nodes, {spec.n} states, {spec.steps} steps of {spec.step:g} s")
@@ -255,9 +257,9 @@ class Recording:
             self._live.send(batch)
 
 
-def _enough(values: int, series: int, sends: int) -> int:
-    """Rows that one send of a series should hold: all series together are to take so many sends for their values."""
-    return min(ROWS, max(1, values // series // max(1, min(SENDS, sends // series))))
+def _enough(values: int, series: int, sends: int, most: int) -> int:
+    """Rows that one send of a series should hold: all series are to take so many sends for their values, one ``most``."""
+    return min(ROWS, max(1, values // series // max(1, min(most, sends // series))))
 
 
 def _column(steps: NDArray[np.int64], values: Array) -> tuple[NDArray[np.int64], Array]:
