@@ -42,7 +42,6 @@ class Progress:
 
     steps: int  # finished by every node
     errors: Mapping[int, float]  # node id -> RMS over the states of its newest error; empty before
-    note: str = ""  # for what everybody is waiting
 
 
 Show: TypeAlias = Callable[[Progress], None]
@@ -71,7 +70,7 @@ class RunResult:
     folder: Path
     trace: Trace
     metrics: Mapping[str, Any]
-    converged: bool  # as the file asks; where nobody knows the truth: whether the nodes agree
+    converged: bool
     warnings: tuple[str, ...]  # what went wrong without stopping the run
 
 
@@ -97,9 +96,9 @@ class Launch:
     def specs(self) -> dict[str, NodeSpec | PlantSpec | RecorderSpec]:
         """Every process' spec, with endpoints that are reserved for it."""
         design, folder, wires = self._design, self._folder, self._wiring.wires()
-        ids, who = sorted(design.nodes), "gateway" if design.plant.outside else "plant"
+        ids = sorted(design.nodes)
         specs: dict[str, NodeSpec | PlantSpec | RecorderSpec] = {
-            who: replace(design.plant, wire=wires["plant"], output=str(folder.rows(who)), recorded=self._record)
+            "plant": replace(design.plant, wire=wires["plant"], output=str(folder.rows("plant")), recorded=self._record)
         }
         for i, spec in design.nodes.items():
             who = f"node-{i}"
@@ -119,7 +118,6 @@ class Launch:
                 truth=str(folder.rows("plant")),
                 estimates={i: str(folder.rows(f"node-{i}")) for i in ids},
                 unknown_inputs=reconstructs(design)[0],
-                flags=any(spec.without for spec in design.nodes.values()),
                 watch_step=getattr(design.scenario.options, "watch_step", None),
                 tick=design.plant.tick,
                 wire=wires["recorder"],
@@ -158,7 +156,7 @@ class Launch:
             estimate = _row(files[i], self._sizes[i], k - 1)
             if x is not None and estimate is not None:
                 errors[i] = float(np.sqrt(np.mean((estimate[:n] - x) ** 2)))
-        show(Progress(min(steps.values()), errors, self._supervisor.note))
+        show(Progress(min(steps.values()), errors))
         return sum(sizes.values())
 
 
@@ -227,18 +225,23 @@ def run_in_process(
     took = time.monotonic() - begin
     rounds = len(trace.t)
     counts: dict[str, Any] = {"rounds": rounds, "rounds_per_second": rounds / took}
-    warnings = _flagged(trace)
+    marked = () if trace.flagged is None else trace.flagged.sum(axis=1).tolist()
+    flags = dict(zip(trace.node_ids.tolist(), marked, strict=False))
+    warnings = _flagged(design, flags, counts)
     if design.scenario.run.inputs:
         warnings += ("run.inputs: a run in one process keeps no tapes; only node processes do",)
     return _finish(folder, design, trace, counts, record=record, warnings=warnings)
 
 
-def _flagged(trace: Trace) -> tuple[str, ...]:
-    """Where messages can be missing, warn of the estimates that their own nodes mark."""
-    counts = () if trace.flagged is None else trace.flagged.sum(axis=1).tolist()
+def _flagged(design: Design, flags: Mapping[int, int], counts: dict[str, Any]) -> tuple[str, ...]:
+    """Under faults, count the estimates that their own nodes mark and warn of them: the verdict does not see them."""
+    if not design.scenario.patchy:
+        return ()
+    counts["flagged"] = {str(i): flags.get(i, 0) for i in design.nodes}
+    steps = design.scenario.run.steps
     return tuple(
-        f"node-{i} flags {count} of its {len(trace.t)} estimates: messages were missing that it needs for them"
-        for i, count in zip(trace.node_ids.tolist(), counts, strict=False)
+        f"node-{i} flags {count} of its {steps} estimates: messages were missing that it needs for them"
+        for i, count in flags.items()
         if count
     )
 
@@ -273,15 +276,13 @@ def gather(folder: RunFolder, design: Design, supervisor: Supervisor, seconds: f
     }
     recorder = supervisor.processes.get("recorder")
     warnings = [f"{p.who}: {text}" for p in supervisor.processes.values() for text in p.warnings]
-    warnings += _flagged(trace)
+    flags = {i: said[f"node-{i}"]["flagged"] for i in design.nodes if said.get(f"node-{i}")}
+    warnings += _flagged(design, flags, counts)
     if design.scenario.patchy:
         counts["faults"] = {what: sum(node["faults"].get(what, 0) for node in nodes) for what in COUNTED}
     if design.scenario.timing.tick:
         counts["timing"] = timeliness(design.scenario, said)
         warnings += untimely(counts["timing"], design.plant.steps)
-    if held := said.get("gateway", {}).get("held"):
-        counts["held"] = held
-        warnings += [f"{key}: {n} samples were late; the last value before was used" for key, n in held.items()]
     lost = recorder is not None and not recorder.done
     if recorder and lost:
         warnings.append(f"{recorder.death()}; the recording was made from the trace instead")
@@ -307,5 +308,4 @@ def _finish(
     report = metrics(trace, design.scenario, counts)
     (folder.root / "metrics.json").write_text(json.dumps(report, indent=2) + "\n")
     folder.tidy()
-    good = report["agree"] if design.scenario.outside else report["converged"]
-    return RunResult(folder.root, trace, report, bool(good), warnings)
+    return RunResult(folder.root, trace, report, bool(report["converged"]), warnings)
