@@ -13,8 +13,8 @@ A tape is a msgpack stream of arrays whose first element says what they are. Vec
     [6, name, arguments]                        another call, one of ``CALLS``
 
 A chunk is written whole, every ``PERIOD`` seconds or ``FULL`` bytes, whichever comes first. So kill -9 costs no more
-than the last tenth of a second, and at most 64 KiB. A call is noted before it is carried out: what made an observer
-fail is there.
+than the last hundredth of a second, and at most 64 KiB. A call is noted before it is carried out: what made an observer
+raise an error is there.
 """
 
 from __future__ import annotations
@@ -42,11 +42,13 @@ from duio_mesh.spec import NodeSpec, packed
 
 VERSION = 1
 MAGIC = "duio_mesh tape"
-PERIOD = 0.1  # seconds between chunks
+PERIOD = 0.01  # seconds between chunks
 FULL = 1 << 16  # bytes
 CALLS = frozenset({"part_with", "welcome", "resume"})
 """Calls beyond the step machine's own that change an observer. A tape holds no others."""
 LOOKS = frozenset({"watched"})  # calls that change nothing that an estimate depends on
+
+MANY = 1 << 20  # vectors in a record
 
 _CHUNK = struct.Struct(">BBBIBI")  # [0, uint32, uint32] in msgpack's fixed form
 _ARRAY_OF_3, _UINT32 = 0x93, 0xCE
@@ -119,7 +121,11 @@ class Tape:
         """
         path.parent.mkdir(parents=True, exist_ok=True)
         self._file = os.fdopen(os.open(path, os.O_RDWR | os.O_CREAT, 0o600), "r+b")
-        _repair(self._file, path)
+        try:
+            _repair(self._file, path)
+        except BaseException:
+            self._file.close()
+            raise
         self._pack = msgpack.Packer().pack
         self._buffer, self._due = bytearray(), 0.0
         self.write((_Kind.HEAD, MAGIC, VERSION, *head[:4], dict(head.made)))  # due at once: there is always a head
@@ -277,7 +283,8 @@ def _records(file: BinaryIO, path: Path) -> _Chunk:
     complete = len(data) == length
     if complete and crc32(data) != crc:
         raise ValueError(f"{path} is damaged between bytes {begin} and {file.tell()}: wrong checksum")
-    unpacker = msgpack.Unpacker(use_list=False, strict_map_key=False, max_buffer_size=max(1, len(data)))
+    most = max(1, length)  # of what a record that is cut short may say of itself
+    unpacker = msgpack.Unpacker(use_list=False, strict_map_key=False, max_buffer_size=most, max_array_len=MANY)
     unpacker.feed(data)
     whole, used = [], 0
     try:

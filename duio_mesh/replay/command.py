@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import sys
 import time
 from collections.abc import Iterable, Iterator, Sequence
@@ -112,7 +113,7 @@ def _main(args: argparse.Namespace) -> int:
     spec, tape = find(args.folder, args.node)
     if args.out and args.out.exists():
         raise ReplayError(f"--out {args.out} already exists; nothing is overwritten")
-    run = kept(args.folder, spec.id, make_observer(spec).estimate())
+    run = kept(args.folder, spec.id, _nothing_yet(spec))
     halt = breakpoint if args.pdb else lambda: None
     blocks = play(spec, read_tape(tape), args.step, halt)
     rows: list[tuple[Block, int]] = []
@@ -134,14 +135,25 @@ def _main(args: argparse.Namespace) -> int:
     return SAME if outcome.verdict(print) else DIFFERENT
 
 
+def _nothing_yet(spec: NodeSpec) -> Estimate:
+    """An estimate with the sizes of this observer's. Raises ReplayError when the spec makes none."""
+    try:
+        return make_observer(spec).estimate()
+    except (ValueError, KeyError, TypeError, IndexError) as e:
+        raise ReplayError(f"the spec of node {spec.id} makes no observer: {type(e).__name__}: {e}") from None
+
+
 def _with_progress(blocks: Iterable[Block], steps: int, *, hidden: bool) -> Iterator[Block]:
     """The same blocks, with a bar for who waits longer than ``PATIENCE``."""
     due = time.monotonic() + PATIENCE
-    with Progress(console=Console(stderr=True), transient=True, disable=hidden) as bar:
-        task = bar.add_task("replaying", total=steps, visible=False)
+    with contextlib.ExitStack() as stack:
+        bar: Progress | None = None
         for block in blocks:
-            if time.monotonic() >= due:
-                bar.update(task, completed=block.steps.stop, visible=True)
+            if bar is None and time.monotonic() >= due and not hidden:
+                bar = stack.enter_context(Progress(console=Console(stderr=True), transient=True))
+                bar.add_task("replaying", total=steps)
+            if bar:
+                bar.update(bar.task_ids[0], completed=block.steps.stop)
             yield block
 
 
@@ -154,7 +166,7 @@ def _write(path: Path, rows: Sequence[tuple[Block, int]]) -> None:
         "y": np.array([block.samples[at].y for block, at in rows]),
         "u": np.array([block.samples[at].u for block, at in rows]),
     }
-    for name, part in zip(("xhat", "what", "vhat"), Estimate._fields, strict=True):
+    for name, part in zip(("xhat", "what", "vhat"), Estimate._fields, strict=False):
         values = np.array([getattr(estimate, part) for estimate in estimates])
         if values.size:
             arrays[name] = values

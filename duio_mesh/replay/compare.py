@@ -13,7 +13,7 @@ from duio_mesh.journal import map_rows
 from duio_mesh.observers.base import Estimate
 from duio_mesh.report.trace_file import read_trace
 
-NAMES = {"state": "x-hat", "unknown_input": "w-hat", "noise": "v-hat"}
+NAMES = {"state": "x-hat", "unknown_input": "w-hat", "noise": "v-hat", "flag": "flag"}
 
 
 class Kept(NamedTuple):
@@ -50,14 +50,15 @@ def kept(folder: Path, node: int, sizes: Estimate) -> Kept | None:
             raise ValueError(f"{path} has no node {node}")
         none = np.zeros((len(trace.t), 0))
         what = none if trace.what is None else trace.what[at]
-        parts = {"state": trace.xhat[at], "unknown_input": what, "noise": trace.vhat.get(node, none)}
-        wrong = [name for name, part in parts.items() if part.shape[1] != getattr(sizes, name).size]
+        flag = none if trace.flagged is None else trace.flagged[at, :, None].astype(np.float64)
+        parts = {"state": trace.xhat[at], "unknown_input": what, "noise": trace.vhat.get(node, none), "flag": flag}
+        wrong = [name for name, part in sizes._asdict().items() if parts[name].shape[1] != part.size]
         if wrong:
             raise ValueError(f"{path} does not fit the spec of node {node}: {NAMES[wrong[0]]} has another size")
         return Kept(path.name, parts, trace.x)
     if rows.exists():
         whole = np.array(map_rows(rows, sum(part.size for part in sizes)))
-        cuts = np.cumsum([sizes.state.size, sizes.unknown_input.size])
+        cuts = np.cumsum([part.size for part in sizes[:-1]])
         return Kept(f"rows/{rows.name}", dict(zip(Estimate._fields, np.split(whole, cuts, axis=1), strict=True)), None)
     return None
 
