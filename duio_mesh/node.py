@@ -60,7 +60,9 @@ class Links:
         edges: list[tuple[str, str, Ready | None]] = [(keys.edge(i, j), f"edge {i} -> {j}", (i, j)) for j in spec.tells]
         self.told = mesh.speak(edges, drop=spec.tick > 0)  # in real time nobody waits for who does not listen
         self.credit = mesh.speak([(keys.credit(i), f"{i} -> plant", (i, "plant"))])
-        self.trace = mesh.speak([(keys.trace(i), f"{i} -> recorder", None)], drop=True)
+        self.trace = mesh.speak(
+            [(keys.trace(i), f"{i} -> recorder", (i, "recorder") if spec.kept else None)], drop=not spec.kept
+        )
         self.exchange: Exchange | FaultyExchange | Realtime
         self.lockstep: Lockstep | Realtime
         self.gaps: AbstractContextManager[object] = nullcontext()

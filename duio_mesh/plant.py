@@ -78,13 +78,17 @@ def run(spec: PlantSpec, report: Report) -> None:
     plant = Plant(spec)
     with Mesh(spec.wire, "plant", report.warn) as mesh:
         keys, ids = mesh.keys, [s.id for s in spec.sensors]
-        nodes = [mesh.hear(keys.credit(i), f"{i} -> plant", f"node-{i}", ready=(i, "plant")) for i in ids]
+        nodes = [mesh.hear(keys.credit(i), f"{i} -> plant", f"node-{i}") for i in ids]
         samples = {i: mesh.speak([(keys.plant(i), f"plant -> {i}", ("plant", i))]) for i in ids}
         mesh.watch()
         mesh.meet()
-        truth = mesh.speak([(keys.truth(), "plant -> recorder", ("plant", "recorder"))], drop=True)
-        if spec.recorded and mesh.unanswered(RECORDER):  # it then reads what it missed from the journals
+        truth = mesh.speak([(keys.truth(), "plant -> recorder", ("plant", "recorder"))], drop=not spec.kept)
+        if spec.kept:
+            mesh.meet()
+        elif spec.recorded and mesh.unanswered(RECORDER):  # it then reads what it missed from the journals
             report.warn(f"the recorder was not there after {RECORDER:g} s; starting without it")
+        for i in ids:  # not before everybody is there: from now on a sample comes within a node's deadline
+            mesh.announce((i, "plant"))
         report("ready")
         credits, begin, cpu = Credits(mesh, nodes, spec), time.monotonic(), time.process_time()
         pace = Pace(spec, credits)

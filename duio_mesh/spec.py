@@ -39,6 +39,11 @@ class Guard:
     tells: tuple[str, ...]  # processes to which it has something to tell
     dials: tuple[str, ...]  # processes that it connects to; the others connect to it
     limit: int  # bytes of the largest payload that it accepts
+    through: str = ""  # the router behind which all others are; "" where they are linked directly
+    probed: bool = False  # a health probe, with this process' own credentials, may ask whether it is alive
+    behind: Mapping[str, tuple[str, ...]] = dataclasses.field(default_factory=dict)
+    """Of a router: direct neighbour -> the processes that are reached through it."""
+    pairs: tuple[tuple[str, str], ...] = ()  # of a router: (source, target) of all that passes it
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,6 +54,8 @@ class Wire:
     listen: tuple[str, ...]  # Zenoh endpoints, e.g. tcp/127.0.0.1:7447
     connect: tuple[str, ...]
     guard: Guard | None = None  # None: whoever reaches a port may speak
+    mode: str = "peer"  # peer | client (of a router) | router
+    start: float = START  # seconds for all processes of a run to find each other
 
 
 UNWIRED = Wire("", (), ())
@@ -73,6 +80,7 @@ class NodeSpec:
     credit: int  # report progress to the plant every this many steps
     block: int  # steps whose samples the plant sends in one frame
     batch: int  # steps between two exchanges: 1, or as many as the observer fuses at once
+    kept: bool = False  # no estimate may be lost on its way to the recorder, which writes them down
     tick: float = 0.0  # wall seconds per step; 0 is lockstep
     wait: float = 0.0  # seconds from a sample's arrival in which all rounds of its step may wait
     faults: Incoming = UNDISTURBED  # on purpose, of its own in-edges
@@ -114,6 +122,7 @@ class PlantSpec:
     tick: float = 0.0  # wall seconds per step; 0: as fast as the slowest node
     wait: float = 0.0  # least seconds between two samples when it is behind the wall clock
     recorded: bool = False  # there is a recorder to wait for, a little
+    kept: bool = False  # it must be there, and no row may be lost on its way to it
     output: str = ""  # file of the true state, float64 rows
     wire: Wire = UNWIRED
 
@@ -135,14 +144,25 @@ class RecorderSpec:
     estimates: Mapping[int, str]  # ... the nodes': rows that never arrived are read from here at the end
     unknown_inputs: int = 0  # of a row's columns after the n states, so many estimate w; the rest the node's own noise
     watch_step: int | None = None  # a step whose rounds the nodes tell one by one
+    kept: bool = False  # write all rows down as they come: their own journals are on other hosts
     tick: float = 0.0  # wall seconds per step, and nodes tell which neighbours were missing; 0 is lockstep
     wire: Wire = UNWIRED
 
 
-Spec = TypeVar("Spec", NodeSpec, PlantSpec, RecorderSpec)
+@dataclasses.dataclass(frozen=True)
+class RouterSpec:
+    """The router process of one host: it carries what processes of hosts that cannot reach each other say."""
+
+    who: str  # router-<host>
+    carries: tuple[str, ...]  # all processes of the run; once they have come and gone, so does the router
+    wire: Wire = UNWIRED
+
+
+AnySpec: TypeAlias = NodeSpec | PlantSpec | RecorderSpec | RouterSpec
+Spec = TypeVar("Spec", NodeSpec, PlantSpec, RecorderSpec, RouterSpec)
 
 _TYPES: dict[str, type[Any]] = {
-    t.__name__: t for t in (Guard, Wire, Rule, Incoming, NodeSpec, SensorSpec, PlantSpec, RecorderSpec)
+    t.__name__: t for t in (Guard, Wire, Rule, Incoming, NodeSpec, SensorSpec, PlantSpec, RecorderSpec, RouterSpec)
 }
 _ARRAY, _RECORD = 1, 2  # msgpack extension codes
 
@@ -175,7 +195,7 @@ def _load(data: bytes) -> Any:
     return msgpack.unpackb(data, ext_hook=_unpack, use_list=False, strict_map_key=False)
 
 
-def write_spec(spec: NodeSpec | PlantSpec | RecorderSpec, path: Path) -> None:
+def write_spec(spec: AnySpec, path: Path) -> None:
     """Write ``spec`` readable by its owner only (mode 0600)."""
     data = packed(spec)
     with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "wb") as f:

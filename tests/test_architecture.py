@@ -28,13 +28,14 @@ FLOORS = [
         "observers",
         "mesh",
         "journal",
+        "ledger",
         "tape",
     ],
     ["report", "process"],
-    ["synthesis", "simulation", "node", "plant", "recorder"],
+    ["synthesis", "simulation", "node", "plant", "recorder", "router", "health"],
     ["nursery", "supervisor", "run_folder", "schema", "credentials", "wiring"],
     ["launcher"],
-    ["api", "console", "generate", "replay"],
+    ["api", "console", "generate", "replay", "deploy"],
     ["cli"],
 ]
 OUTSIDE = {  # what a room may import from outside the standard library

@@ -12,6 +12,7 @@ from pydantic import BaseModel
 from duio_mesh.methods import METHODS
 from duio_mesh.scenario import model, schema
 from duio_mesh.scenario.disturbed import read_faults
+from duio_mesh.scenario.hosts import read_hosts
 from duio_mesh.scenario.network import read_graph, read_nodes
 from duio_mesh.scenario.overrides import apply_override
 from duio_mesh.scenario.plant import PLANT, PlantParts, read_plant
@@ -70,6 +71,7 @@ def _scenario(document: dict[str, Any], problems: Problems, options_of: OptionsO
     settings = _run(run, len(nodes or ()) * (parts.states.number if parts.states else 0), problems)
     faults = read_faults(document.get("faults"), graph, run.get("seed", 0), problems)
     security = _security(document, problems)
+    hosts = read_hosts(document, nodes, security, problems)
     timing = read_timing(document, parts.plant, run, problems)
     if problems or parts.plant is None or nodes is None or graph is None or settings is None:
         return None
@@ -89,6 +91,7 @@ def _scenario(document: dict[str, Any], problems: Problems, options_of: OptionsO
         faults,
         security,
         timing,
+        hosts=hosts,
     )
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
@@ -177,6 +178,26 @@ class Security(NamedTuple):
 OPEN = Security()
 
 
+class Host(NamedTuple):
+    """One machine of a run over several."""
+
+    address: str  # under which the others reach it
+    listen: str  # IP address to listen on
+    port: int  # the first one
+    runs: tuple[str, ...]  # names of processes
+    via: str  # routed: the host whose router this one's router dials; "" for the first
+
+
+class Hosts(NamedTuple):
+    """Who runs where (docs/deploy.md)."""
+
+    by_name: Mapping[str, Host] = MappingProxyType({})  # in the order of the file
+    routed: bool = False  # processes talk through one router per host
+
+
+NO_HOSTS = Hosts()
+
+
 @dataclass(frozen=True)
 class Scenario:
     """A whole topology file, resolved."""
@@ -193,6 +214,7 @@ class Scenario:
     faults: Faults = NO_FAULTS
     security: Security = OPEN
     timing: Timing = LOCKSTEP
+    hosts: Hosts = NO_HOSTS
 
     @property
     def patchy(self) -> bool:

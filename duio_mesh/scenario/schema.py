@@ -15,7 +15,7 @@ from duio_mesh.faults import MAX_DELAY
 from duio_mesh.scenario.problems import listed
 from duio_mesh.scenario.strict import Strict
 
-RESERVED = dict.fromkeys(("hosts",), "is reserved for a later version of duio_mesh")
+RESERVED: dict[str, str] = {}
 """Top-level keys that no version accepts yet; to accept one, give it a field in Topology and delete it here."""
 
 MAX_STATES = 2000
@@ -378,6 +378,29 @@ class Protected(Strict):
     security: Annotated[Mode | Security, Field(description="who may speak")] = "open"
 
 
+class Host(Strict):
+    """One machine, and who runs there."""
+
+    address: Annotated[Name, Field(description="IP address or name under which the other hosts reach this one")]
+    runs: Annotated[
+        list[int | Literal["plant", "recorder"]], Field(min_length=1, description="nodes by number; plant; recorder")
+    ]
+    port: Annotated[int, Field(ge=1, le=65_535, description="the first; one per process, or the router's alone")] = 7447
+    listen: Annotated[Name | None, Field(description="IP address to listen on; default: the address")] = None
+    via: Annotated[
+        Name | None, Field(description="routed: an earlier host, whose router this one's dials; default: the first")
+    ] = None
+
+
+class Placed(Strict):
+    """For several hosts."""
+
+    hosts: Annotated[dict[str, Host] | None, Field(description="for export: who runs where")] = None
+    transport: Annotated[
+        Literal["direct", "routed"], Field(description="routed: through one Zenoh router per host")
+    ] = "direct"
+
+
 class Heading(Strict):
     """What a topology is called."""
 
@@ -385,7 +408,7 @@ class Heading(Strict):
     description: Annotated[str, Field(max_length=10_000)] = ""
 
 
-class Topology(Heading, Protected, Timed):
+class Topology(Heading, Protected, Timed, Placed):
     """A whole topology file. ``observer`` holds ``method`` and that method's own options."""
 
     plant: str | Plant
