@@ -116,6 +116,10 @@ def _main(args: argparse.Namespace) -> int:
     flags = {"run.steps": args.steps, "run.seed": args.seed, "run.inputs": "true" if args.inputs else None}
     overrides = args.overrides + [f"{path}={value}" for path, value in flags.items() if value is not None]
     scenario = load_scenario(args.topology, overrides, options_of=synthesis.options_of)
+    if scenario.outside and args.in_process:
+        raise ScenarioError(
+            ["--in-process: the measurements of this file come from outside (external:), which only processes can hear"]
+        )
     if args.out and args.out.exists() and (not args.out.is_dir() or any(args.out.iterdir())):
         raise ScenarioError([f"--out {args.out}: already exists and is not empty; a run is never overwritten"])
 

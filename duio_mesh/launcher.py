@@ -42,6 +42,7 @@ class Progress:
 
     steps: int  # finished by every node
     errors: Mapping[int, float]  # node id -> RMS over the states of its newest error; empty before
+    note: str = ""  # for what everybody is waiting
 
 
 Show: TypeAlias = Callable[[Progress], None]
@@ -70,7 +71,7 @@ class RunResult:
     folder: Path
     trace: Trace
     metrics: Mapping[str, Any]
-    converged: bool
+    converged: bool  # as the file asks; where nobody knows the truth: whether the nodes agree
     warnings: tuple[str, ...]  # what went wrong without stopping the run
 
 
@@ -96,9 +97,9 @@ class Launch:
     def specs(self) -> dict[str, NodeSpec | PlantSpec | RecorderSpec]:
         """Every process' spec, with endpoints that are reserved for it."""
         design, folder, wires = self._design, self._folder, self._wiring.wires()
-        ids = sorted(design.nodes)
+        ids, who = sorted(design.nodes), "gateway" if design.plant.outside else "plant"
         specs: dict[str, NodeSpec | PlantSpec | RecorderSpec] = {
-            "plant": replace(design.plant, wire=wires["plant"], output=str(folder.rows("plant")), recorded=self._record)
+            who: replace(design.plant, wire=wires["plant"], output=str(folder.rows(who)), recorded=self._record)
         }
         for i, spec in design.nodes.items():
             who = f"node-{i}"
@@ -156,7 +157,7 @@ class Launch:
             estimate = _row(files[i], self._sizes[i], k - 1)
             if x is not None and estimate is not None:
                 errors[i] = float(np.sqrt(np.mean((estimate[:n] - x) ** 2)))
-        show(Progress(min(steps.values()), errors))
+        show(Progress(min(steps.values()), errors, self._supervisor.note))
         return sum(sizes.values())
 
 
@@ -283,6 +284,9 @@ def gather(folder: RunFolder, design: Design, supervisor: Supervisor, seconds: f
     if design.scenario.timing.tick:
         counts["timing"] = timeliness(design.scenario, said)
         warnings += untimely(counts["timing"], design.plant.steps)
+    if held := said.get("gateway", {}).get("held"):
+        counts["held"] = held
+        warnings += [f"{key}: {n} samples were late; the last value before was used" for key, n in held.items()]
     lost = recorder is not None and not recorder.done
     if recorder and lost:
         warnings.append(f"{recorder.death()}; the recording was made from the trace instead")
@@ -308,4 +312,5 @@ def _finish(
     report = metrics(trace, design.scenario, counts)
     (folder.root / "metrics.json").write_text(json.dumps(report, indent=2) + "\n")
     folder.tidy()
-    return RunResult(folder.root, trace, report, bool(report["converged"]), warnings)
+    good = report["agree"] if design.scenario.outside else report["converged"]
+    return RunResult(folder.root, trace, report, bool(good), warnings)

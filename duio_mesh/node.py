@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from functools import partial
-from itertools import chain
+from itertools import chain, islice
 from math import isfinite
 from typing import Any
 
@@ -22,7 +22,7 @@ from duio_mesh.errors import RunError
 from duio_mesh.journal import MISSING, Journal, missing
 from duio_mesh.mesh import Mesh
 from duio_mesh.mesh.faulty import LONG_WAY, Arrived, FaultyExchange
-from duio_mesh.mesh.lockstep import Exchange, Line, Lockstep
+from duio_mesh.mesh.lockstep import Ended, Exchange, Line, Lockstep
 from duio_mesh.mesh.realtime import Realtime
 from duio_mesh.mesh.session import Ready
 from duio_mesh.observers import Observer, make_observer
@@ -73,7 +73,9 @@ class Links:
             self.sample: Callable[[int, int, int], Array] = clock.sample
             return
         self.lockstep = lockstep = Lockstep(mesh, spec.deadline)
-        self.sample = partial(lockstep.take, Line(mesh, keys.plant(i), f"plant -> {i}", "plant", ("plant", i), window))
+        plant = Line(mesh, keys.plant(i), f"plant -> {i}", "plant", ("plant", i), window)
+        plant.patient = spec.outside
+        self.sample = partial(lockstep.take, plant)
         heard = {
             j: Line(mesh, keys.edge(j, i), f"edge {j} -> {i}", f"node-{j}", (j, i), window, room) for j in spec.hears
         }
@@ -97,12 +99,14 @@ def live(spec: NodeSpec, observer: Observer, links: Links, journal: Journal, rep
     samples = _samples(links, spec)
     samples = chain((next(samples),), samples)  # the first may take its time: the others are still starting
     begin, cpu = time.monotonic(), time.process_time()
-    rounds, doubtful, promised, beat = 0, 0, spec.credit, begin + BEAT
+    rounds, doubtful, promised, beat, steps = 0, 0, spec.credit, begin + BEAT, spec.steps
     for k in range(0, spec.steps, spec.batch):
         done = min(k + spec.batch, spec.steps)
-        for _ in range(k, done):
-            sample = next(samples)
+        for sample in (block := list(islice(samples, done - k))):
             observer.sample(sample[:p], sample[p:])
+        if not block:  # the sensors are done before we are
+            links.credit.send(steps := k, 0, NO_VECTOR)
+            break
         for r in range(observer.rounds):
             observer.exchange(r, exchange(k, r, observer.message(r)))
             rounds += 1
@@ -121,7 +125,7 @@ def live(spec: NodeSpec, observer: Observer, links: Links, journal: Journal, rep
             promised = done + spec.credit
             links.credit.send(done, 0, NO_VECTOR)
     seconds, cpu_seconds = time.monotonic() - begin, time.process_time() - cpu
-    return {"steps": spec.steps, "rounds": rounds, "seconds": seconds, "cpu_seconds": cpu_seconds, "flagged": doubtful}
+    return {"steps": steps, "rounds": rounds, "seconds": seconds, "cpu_seconds": cpu_seconds, "flagged": doubtful}
 
 
 def _samples(links: Links, spec: NodeSpec) -> Iterator[Array]:
@@ -129,7 +133,10 @@ def _samples(links: Links, spec: NodeSpec) -> Iterator[Array]:
     size = spec.p + spec.m
     for k in range(0, spec.steps, spec.block):
         count = min(spec.block, spec.steps - k)
-        yield from links.sample(k, 0, count * size).reshape(count, size)
+        try:
+            yield from links.sample(k, 0, count * size).reshape(count, size)
+        except Ended:
+            return
 
 
 def _hand_over(observer: Observer, k: int, arrived: Sequence[Arrived]) -> None:

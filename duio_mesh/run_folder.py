@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import os
 import shutil
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -81,7 +82,17 @@ class RunFolder:
         rows = {i: map_rows(self.rows(f"node-{i}"), size) for i, size in sizes.items()}
         steps = max(map(len, rows.values()))
         watched = {i: np.array(map_rows(aside(self.rows(f"node-{i}")), COLUMNS)) for i in sizes}
-        return split_trace(design, _padded(x, steps), {i: _padded(r, steps) for i, r in rows.items()}, watched)
+        trace = split_trace(design, _padded(x, steps), {i: _padded(r, steps) for i, r in rows.items()}, watched)
+        return replace(trace, samples=self._samples(design, steps))
+
+    def _samples(self, design: Design, steps: int) -> dict[int, Array]:
+        """What a gateway handed on to every node; {} when the plant was simulated."""
+        if (outside := design.plant.outside) is None:
+            return {}
+        widths = outside.widths()
+        rows = _padded(map_rows(self.rows("gateway"), sum(widths.values())), steps)
+        ends = np.cumsum(list(widths.values()))
+        return {i: rows[:, end - width : end] for (i, width), end in zip(widths.items(), ends, strict=True)}
 
     def tidy(self) -> None:
         """Remove the journals (they are in trace.npz now) and empty files of standard error."""

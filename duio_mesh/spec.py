@@ -86,6 +86,7 @@ class NodeSpec:
     faults: Incoming = UNDISTURBED  # on purpose, of its own in-edges
     spoils: Mapping[int, tuple[Rule, ...]] = dataclasses.field(default_factory=dict)  # of frames to out-neighbours
     without: str = ""  # what to do without a neighbour's message; "" where none can be missing
+    outside: bool = False  # samples come from outside: they may take their time, and end before the last step
     output: str = ""  # file of this node's own estimates, float64 rows; "" keeps none
     wire: Wire = UNWIRED
 
@@ -100,6 +101,25 @@ class SensorSpec:
     known: tuple[int, ...]  # columns of B
     channel: Array  # F_i (p, r)
     noise: Signals  # r signals
+
+
+@dataclasses.dataclass(frozen=True)
+class Outside:
+    """Where the samples come from when no plant is simulated: publishers on a Zenoh network; see duio_mesh.gateway."""
+
+    listen: str  # Zenoh endpoint where publishers connect; "" when the gateway connects to a router
+    connect: str
+    encoding: str  # one of duio_mesh.sensors.messages.ENCODINGS
+    feeds: Mapping[int, tuple[str, ...]]  # node -> keys whose numbers, one after the other, are [y_i; u_i]
+    sizes: Mapping[str, int]  # key -> numbers in each of its messages
+    strays: str  # key expression of the same form as the keys; what else comes on it is refused and counted. "": none
+    end: str  # key on which a publisher says that it is over; "": nobody does
+    hold: float  # seconds after a step's first sample in which the others may come; infinite: up to the deadline
+    start_within: float  # seconds in which every sensor must have spoken
+
+    def widths(self) -> dict[int, int]:
+        """Numbers in [y_i; u_i], by ascending node: a row of a gateway's journal holds them one after the other."""
+        return {i: sum(self.sizes[key] for key in self.feeds[i]) for i in sorted(self.feeds)}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -123,7 +143,8 @@ class PlantSpec:
     wait: float = 0.0  # least seconds between two samples when it is behind the wall clock
     recorded: bool = False  # there is a recorder to wait for, a little
     kept: bool = False  # it must be there, and no row may be lost on its way to it
-    output: str = ""  # file of the true state, float64 rows
+    output: str = ""  # file of the true state (of a gateway: of all samples), float64 rows
+    outside: Outside | None = None  # a gateway takes the plant's place
     wire: Wire = UNWIRED
 
 
@@ -162,7 +183,8 @@ AnySpec: TypeAlias = NodeSpec | PlantSpec | RecorderSpec | RouterSpec
 Spec = TypeVar("Spec", NodeSpec, PlantSpec, RecorderSpec, RouterSpec)
 
 _TYPES: dict[str, type[Any]] = {
-    t.__name__: t for t in (Guard, Wire, Rule, Incoming, NodeSpec, SensorSpec, PlantSpec, RecorderSpec, RouterSpec)
+    t.__name__: t
+    for t in (Guard, Wire, Rule, Incoming, NodeSpec, SensorSpec, Outside, PlantSpec, RecorderSpec, RouterSpec)
 }
 _ARRAY, _RECORD = 1, 2  # msgpack extension codes
 

@@ -58,6 +58,7 @@ class Supervisor:
     def __init__(self) -> None:
         """Start the nursery; it gets ready by itself while the caller goes on."""
         self.processes: dict[str, Process] = {}
+        self.note = ""  # what a gateway waits for
         self._beats = 0  # whatever anybody says shows that things move
         self._status, write = os.pipe()
         self._control, theirs = socket.socketpair()
@@ -182,6 +183,8 @@ class Supervisor:
             process.done = event
         elif what == "failed":
             process.failure = event["text"]
+        elif what == "sensors":
+            self.note = event["text"]
         elif what == "warning":
             process.warnings.append(event["text"])
         elif what == "exit":

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from duio_mesh.mesh.frames import Decoder, Encoder, Frame, Rejected
 from duio_mesh.mesh.keys import Keys
+from duio_mesh.mesh.outside import Heard, OutsideWorld
 from duio_mesh.mesh.session import Mesh, Outlet, Source
 
-__all__ = ["Decoder", "Encoder", "Frame", "Keys", "Mesh", "Outlet", "Rejected", "Source"]
+__all__ = ["Decoder", "Encoder", "Frame", "Heard", "Keys", "Mesh", "Outlet", "OutsideWorld", "Rejected", "Source"]

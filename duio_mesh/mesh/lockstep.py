@@ -31,6 +31,10 @@ FEW = 48  # numbers
 TICK = 0.1  # seconds between the watchdog's looks
 
 
+class Ended(Exception):
+    """A patient line's sender has said that there will be no further step."""
+
+
 class Form(NamedTuple):
     """What a payload of ``size`` numbers looks like."""
 
@@ -74,6 +78,8 @@ class Line(Source):
         self.receive = self._subscriber.handler.recv
         self.poll = self._subscriber.handler.try_recv
         mesh.sources.append(self)
+
+    patient = False  # its sender itself says when it has waited too long, and may end early by an empty frame
 
     def close(self) -> None:
         """End the wait of ``receive``, once it has returned everything that had come."""
@@ -135,6 +141,8 @@ class Lockstep:
     def _held(self, line: Line, k: int, r: int, size: int) -> Array | None:
         """The frame of step k, round r, if it came before it was due and has the right size."""
         vector = line.waiting.pop((k, r), None)
+        if line.patient and vector is not None and not vector.size:
+            raise Ended
         if vector is not None and vector.size != size:
             self._mesh.reject(line, f"{vector.size} numbers instead of {size}")
             return None
@@ -179,7 +187,7 @@ class Lockstep:
             at, now = self._at, time.monotonic()
             if at is not seen:
                 seen, since = at, now
-            if at and (at[0].gone or now - since > self._deadline):
+            if at and (at[0].gone or (now - since > self._deadline and not at[0].patient)):
                 at[0].close()
 
 

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from duio_mesh.arrays import Array
+from duio_mesh.report.agreement import agreement, verdict
 from duio_mesh.scenario.model import Convergence, Scenario
 from duio_mesh.trace import Trace
 
@@ -28,7 +29,8 @@ def metrics(trace: Trace, scenario: Scenario, counts: Mapping[str, Any]) -> dict
     ``counts`` is what the run itself counted (rounds, rounds_per_second, messages, faults, ...), passed on as it is.
     A node's ``rms`` is over the steps of the verdict, its ``final`` at the last step, both per component; null where it
     has no finite estimate (a lost process, a diverged observer). A run that ended early is ``incomplete`` and has not
-    converged, however small its errors were.
+    converged, however small its errors were. Without a truth ``converged`` and the errors are null, and the verdict is
+    about how far the nodes agree (``report/agreement.py``); such a run may be over before its last step.
     """
     wanted = scenario.run.convergence
     window = judged(trace, wanted)
@@ -36,11 +38,21 @@ def metrics(trace: Trace, scenario: Scenario, counts: Mapping[str, Any]) -> dict
     ids = trace.node_ids.tolist()
     complete = len(trace.t) >= scenario.run.steps and not np.isnan(trace.xhat).any()
     good = complete and converged(trace, wanted)
-    return {
+    said: dict[str, Any] = {
         "verdict": "converged" if good else "not converged" if complete else "incomplete",
         "converged": good,
+    }
+    nodes = {str(i): {"rms": _finite(rms[at]), "final": _finite(final[at])} for at, i in enumerate(ids)}
+    if scenario.outside:
+        complete = len(trace.t) > 0 and not counts.get("failure") and not np.isnan(trace.xhat).any()
+        figures = agreement(trace, scenario, window)
+        said = verdict(figures, wanted.rms_below, complete=complete)
+        for i, found in figures.items():
+            nodes[str(i)] |= {name: _finite(value) for name, value in found.items()}
+    return {
+        **said,
         "criterion": {"rms_below": wanted.rms_below, "from_step": window.start},
-        "nodes": {str(i): {"rms": _finite(rms[at]), "final": _finite(final[at])} for at, i in enumerate(ids)},
+        "nodes": nodes,
         "steps": len(trace.t),
         "seed": scenario.run.seed,
         **counts,

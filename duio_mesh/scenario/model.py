@@ -14,6 +14,7 @@ import numpy as np
 
 from duio_mesh.arrays import Array
 from duio_mesh.faults import NO_FAULTS, Faults
+from duio_mesh.spec import Outside
 
 Signal: TypeAlias = tuple[Mapping[str, Mapping[str, float]], ...]
 """A sum of terms, each ``{kind: parameters}``; ``duio_mesh.dynamics.signal`` evaluates it. () is zero."""
@@ -214,6 +215,7 @@ class Scenario:
     faults: Faults = NO_FAULTS
     security: Security = OPEN
     timing: Timing = LOCKSTEP
+    outside: Outside | None = None  # the measurements come from outside: nobody knows the true state
     hosts: Hosts = NO_HOSTS
 
     @property

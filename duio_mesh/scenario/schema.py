@@ -184,6 +184,40 @@ class Node(Strict):
     C: Annotated[Matrix, Field(min_length=1, max_length=MAX_STATES)]
     knows: Annotated[list[str], Field(description="names of the inputs that this node is told", default_factory=list)]
     noise: Noise | float | None = None
+    keys: Annotated[
+        str | Annotated[list[Name], Field(min_length=1)] | None,
+        Field(description="external: one key for [y; u], or one for each of its numbers; default: external.key"),
+    ] = None
+
+
+Encoding: TypeAlias = Literal[
+    "json", "float64", "std_msgs/Float64", "std_msgs/Float64MultiArray", "sensor_msgs/Temperature"
+]
+
+
+class External(Strict):
+    """Where the measurements come from when the plant is not simulated."""
+
+    model: Annotated[str | None, Field(description="plant file, with plant: external")] = None
+    key: Annotated[str | None, Field(description="Zenoh key of a node's [y; u]; {node} is its id")] = None
+    encoding: Encoding = "json"
+    listen: Annotated[str | None, Field(description="where publishers connect; default tcp/127.0.0.1:7447")] = None
+    connect: Annotated[str | None, Field(description="a Zenoh router to go to, instead of listening")] = None
+    exposed: Annotated[bool, Field(description="whoever reaches the port may publish measurements")] = False
+    end: Annotated[str | None, Field(description="key on which a publisher says that it is over")] = None
+    hold: Annotated[
+        float | None,
+        Field(gt=0, le=86_400, description="seconds after a step's first sample; then late sensors keep their values"),
+    ] = None
+    start_within: Annotated[
+        float, Field(gt=0, le=86_400, description="seconds in which every sensor must have spoken")
+    ] = 60.0
+
+    @model_validator(mode="after")
+    def _one_way(self) -> External:
+        if self.listen is not None and self.connect is not None:
+            raise _misfit("give either listen or connect, not both", at="connect")
+        return self
 
 
 Link: TypeAlias = Annotated[list[float], Field(min_length=2, max_length=3)]
@@ -417,3 +451,4 @@ class Topology(Heading, Protected, Timed, Placed):
     graph: Graph
     run: Run
     faults: Faults | None = None
+    external: External | None = None

@@ -47,8 +47,9 @@ def node_spec(
         deadline=run.deadline,
         window=_window(run),
         credit=_quarter(run),
-        block=_quarter(run),
+        block=_block(scenario),
         batch=run.batch,
+        outside=scenario.outside is not None,
         faults=scenario.faults.into(i),
         spoils=scenario.faults.spoilt_by(i),
         without=scenario.options.without if scenario.patchy else "",
@@ -63,6 +64,11 @@ def _window(run: Run) -> int:
 def _quarter(run: Run) -> int:
     """Steps between two words from node to plant, and in one frame from plant to node: few enough to keep both busy."""
     return max(1, _window(run) // 4)
+
+
+def _block(scenario: Scenario) -> int:
+    """Steps in one frame of samples: what comes from outside is passed on as soon as it is there."""
+    return 1 if scenario.outside else _quarter(scenario.run)
 
 
 def plant_spec(scenario: Scenario) -> PlantSpec:
@@ -98,8 +104,9 @@ def plant_spec(scenario: Scenario) -> PlantSpec:
         seed=run.seed,
         steps=run.steps,
         window=_window(run),
-        block=_quarter(run),
+        block=_block(scenario),
         deadline=run.deadline,
+        outside=scenario.outside,
     )
 
 
