@@ -119,6 +119,7 @@ class Launch:
                 truth=str(folder.rows("plant")),
                 estimates={i: str(folder.rows(f"node-{i}")) for i in ids},
                 unknown_inputs=reconstructs(design)[0],
+                flags=any(spec.without for spec in design.nodes.values()),
                 watch_step=getattr(design.scenario.options, "watch_step", None),
                 tick=design.plant.tick,
                 wire=wires["recorder"],
@@ -226,23 +227,18 @@ def run_in_process(
     took = time.monotonic() - begin
     rounds = len(trace.t)
     counts: dict[str, Any] = {"rounds": rounds, "rounds_per_second": rounds / took}
-    marked = () if trace.flagged is None else trace.flagged.sum(axis=1).tolist()
-    flags = dict(zip(trace.node_ids.tolist(), marked, strict=False))
-    warnings = _flagged(design, flags, counts)
+    warnings = _flagged(trace)
     if design.scenario.run.inputs:
         warnings += ("run.inputs: a run in one process keeps no tapes; only node processes do",)
     return _finish(folder, design, trace, counts, record=record, warnings=warnings)
 
 
-def _flagged(design: Design, flags: Mapping[int, int], counts: dict[str, Any]) -> tuple[str, ...]:
-    """Under faults, count the estimates that their own nodes mark and warn of them: the verdict does not see them."""
-    if not design.scenario.patchy:
-        return ()
-    counts["flagged"] = {str(i): flags.get(i, 0) for i in design.nodes}
-    steps = design.scenario.run.steps
+def _flagged(trace: Trace) -> tuple[str, ...]:
+    """Where messages can be missing, warn of the estimates that their own nodes mark."""
+    counts = () if trace.flagged is None else trace.flagged.sum(axis=1).tolist()
     return tuple(
-        f"node-{i} flags {count} of its {steps} estimates: messages were missing that it needs for them"
-        for i, count in flags.items()
+        f"node-{i} flags {count} of its {len(trace.t)} estimates: messages were missing that it needs for them"
+        for i, count in zip(trace.node_ids.tolist(), counts, strict=False)
         if count
     )
 
@@ -277,8 +273,7 @@ def gather(folder: RunFolder, design: Design, supervisor: Supervisor, seconds: f
     }
     recorder = supervisor.processes.get("recorder")
     warnings = [f"{p.who}: {text}" for p in supervisor.processes.values() for text in p.warnings]
-    flags = {i: said[f"node-{i}"]["flagged"] for i in design.nodes if said.get(f"node-{i}")}
-    warnings += _flagged(design, flags, counts)
+    warnings += _flagged(trace)
     if design.scenario.patchy:
         counts["faults"] = {what: sum(node["faults"].get(what, 0) for node in nodes) for what in COUNTED}
     if design.scenario.timing.tick:

@@ -26,7 +26,7 @@ from duio_mesh.mesh.lockstep import Ended, Exchange, Line, Lockstep
 from duio_mesh.mesh.realtime import Realtime
 from duio_mesh.mesh.session import Ready
 from duio_mesh.observers import Observer, make_observer
-from duio_mesh.observers.absence import Late, flagged, take_late
+from duio_mesh.observers.absence import Late, take_late
 from duio_mesh.observers.base import reader
 from duio_mesh.observers.watch import watcher
 from duio_mesh.process import Report, main
@@ -99,7 +99,7 @@ def live(spec: NodeSpec, observer: Observer, links: Links, journal: Journal, rep
     samples = _samples(links, spec)
     samples = chain((next(samples),), samples)  # the first may take its time: the others are still starting
     begin, cpu = time.monotonic(), time.process_time()
-    rounds, doubtful, promised, beat, steps = 0, 0, spec.credit, begin + BEAT, spec.steps
+    rounds, promised, beat, steps = 0, spec.credit, begin + BEAT, spec.steps
     for k in range(0, spec.steps, spec.batch):
         done = min(k + spec.batch, spec.steps)
         for sample in (block := list(islice(samples, done - k))):
@@ -116,7 +116,6 @@ def live(spec: NodeSpec, observer: Observer, links: Links, journal: Journal, rep
                 report.beat()
         if len(figures := watched()):
             journal.aside(spec.options["watch_step"], figures)
-        doubtful += flagged(observer) * (done - k)  # estimates that the observer marks
         for estimate in estimates():
             if not isfinite(zeros.dot(estimate.state)):
                 raise RunError(f"node-{spec.id}: the estimate overflowed at step {k}; is the plant unstable?")
@@ -125,7 +124,7 @@ def live(spec: NodeSpec, observer: Observer, links: Links, journal: Journal, rep
             promised = done + spec.credit
             links.credit.send(done, 0, NO_VECTOR)
     seconds, cpu_seconds = time.monotonic() - begin, time.process_time() - cpu
-    return {"steps": steps, "rounds": rounds, "seconds": seconds, "cpu_seconds": cpu_seconds, "flagged": doubtful}
+    return {"steps": steps, "rounds": rounds, "seconds": seconds, "cpu_seconds": cpu_seconds}
 
 
 def _samples(links: Links, spec: NodeSpec) -> Iterator[Array]:

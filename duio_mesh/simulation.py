@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 
 import numpy as np
 
@@ -11,7 +10,7 @@ from duio_mesh.arrays import Array
 from duio_mesh.dynamics import Plant
 from duio_mesh.faults import Reception, Stamp
 from duio_mesh.observers import make_observer
-from duio_mesh.observers.absence import Late, flagged, take_late
+from duio_mesh.observers.absence import Late, take_late
 from duio_mesh.observers.base import reader
 from duio_mesh.observers.watch import watcher
 from duio_mesh.spec import NodeSpec
@@ -24,7 +23,7 @@ def simulate(design: Design, progress: Callable[[int], None] = lambda _: None) -
     plant = Plant(design.plant)
     observers = {i: make_observer(spec) for i, spec in design.nodes.items()}
     network = {i: _InEdges(spec) for i, spec in design.nodes.items()}
-    truth, rows, marks = [], {i: list[Array]() for i in observers}, {i: list[bool]() for i in observers}
+    truth, rows = [], {i: list[Array]() for i in observers}
     steps, batch = design.plant.steps, design.scenario.run.batch
     watched = {i: (watcher(observer), list[Array]()) for i, observer in observers.items()}
     for k in range(0, steps, batch):
@@ -45,18 +44,16 @@ def simulate(design: Design, progress: Callable[[int], None] = lambda _: None) -
                 take_late(observer, late)
                 observer.exchange(r, received)
         for i, observer in observers.items():
-            marks[i] += [flagged(observer)] * (done - k)
             rows[i] += [np.concatenate(estimate) for estimate in reader(observer)()]
             look, seen = watched[i]
             seen.append(look())
         progress(done)
-    trace = split_trace(
+    return split_trace(
         design,
         np.array(truth),
         {i: np.array(r) for i, r in rows.items()},
         {i: np.concatenate(seen) for i, (_, seen) in watched.items()},
     )
-    return replace(trace, flagged=np.array([marks[int(i)] for i in trace.node_ids]))
 
 
 class _InEdges:
@@ -78,21 +75,28 @@ class _InEdges:
 
 
 def split_trace(design: Design, x: Array, rows: dict[int, Array], watched: Mapping[int, Array]) -> Trace:
-    """Cut every node's rows [x-hat | w-hat | v-hat] (K, size) into the named arrays of a trace.
+    """Cut every node's rows [x-hat | w-hat | v-hat | flag] (K, size) into the named arrays of a trace.
 
+    There is a flag where messages can be missing. A row of NaN is a step without an estimate, and not flagged; an
+    estimate that has left the floats is flagged whatever the node says.
     ``watched``: every node's rows (m, 3) of the rounds of one step; m = 0 where none was watched.
     """
     n, ids = design.scenario.plant.n, sorted(rows)
     q, r = reconstructs(design)
     xhat = np.stack([rows[i][:, :n] for i in ids])
+    flagged = None
+    if all(design.nodes[i].without for i in ids):
+        flags = np.stack([rows[i][:, -1] for i in ids])
+        flagged = (flags > 0) | (~np.isnan(flags) & ~np.isfinite(xhat).all(axis=2))
     return Trace(
         t=np.arange(x.shape[0], dtype=np.float64) * design.plant.step,
         x=x,
         node_ids=np.array(ids, dtype=np.int64),
         xhat=xhat,
         what=np.stack([rows[i][:, n : n + q] for i in ids]) if q else None,
-        vhat={i: rows[i][:, n + q :] for i in ids if r[i]},
+        vhat={i: rows[i][:, n + q : n + q + r[i]] for i in ids if r[i]},
         rounds={i: rounds for i, rounds in watched.items() if len(rounds)},
+        flagged=flagged,
     )
 
 

@@ -154,7 +154,7 @@ class RecorderSpec:
 
     name: str
     n: int
-    sizes: Mapping[int, int]  # node id -> floats per estimate row (n, plus what a method reconstructs)
+    sizes: Mapping[int, int]  # node id -> floats per estimate row (n, plus what a method reconstructs, plus the flag)
     arcs: tuple[tuple[int, int], ...]
     step: float  # seconds between samples
     steps: int
@@ -164,6 +164,7 @@ class RecorderSpec:
     truth: str  # the plant's output file and ...
     estimates: Mapping[int, str]  # ... the nodes': rows that never arrived are read from here at the end
     unknown_inputs: int = 0  # of a row's columns after the n states, so many estimate w; the rest the node's own noise
+    flags: bool = False  # the last column of a row says whether the node marks its estimate
     watch_step: int | None = None  # a step whose rounds the nodes tell one by one
     kept: bool = False  # write all rows down as they come: their own journals are on other hosts
     tick: float = 0.0  # wall seconds per step, and nodes tell which neighbours were missing; 0 is lockstep

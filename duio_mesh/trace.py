@@ -25,7 +25,18 @@ class Trace:
     samples: dict[int, Array] = field(default_factory=dict)
     """Node id -> (K, p + m) [y_i; u_i] as they came from outside; {} when the plant was simulated."""
     flagged: NDArray[np.bool_] | None = None
-    """(N, K) estimates that the node itself marks as not to be trusted; only the oracle keeps them so far."""
+    """(N, K) estimates that the node itself marks as not to be trusted; None where no message can be missing."""
+
+    @property
+    def lost(self) -> NDArray[np.bool_]:
+        """(N, K) steps of which a node has no estimate, in a run that goes on without it.
+
+        There are none where no message can be missing: such a run ends with its first loss. An estimate that has left
+        the floats is NaN too, but it is one, and it is flagged.
+        """
+        if self.flagged is None:
+            return np.zeros(self.xhat.shape[:2], dtype=bool)
+        return np.asarray(np.isnan(self.xhat).all(axis=2) & ~self.flagged)
 
     def arrays(self) -> dict[str, NDArray[np.generic]]:
         """The arrays under the names of trace.npz."""

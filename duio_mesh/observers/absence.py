@@ -82,6 +82,11 @@ class _Guard:
         """The method's vector, then the doubt."""
         return np.append(self._inner.message(r), self._doubt)
 
+    @property
+    def flagged(self) -> bool:
+        """Is the newest estimate marked?"""
+        return self._doubt > 0
+
     def watched(self) -> Array:
         """What the method has kept of its rounds."""
         return watcher(self._inner)()
@@ -91,8 +96,11 @@ class _Guard:
         self._late.extend(arrived)
 
     def estimate(self) -> Estimate:
-        """As the method has."""
-        return self._inner.estimate()
+        """As the method has, and the mark."""
+        return self._marked(self._inner.estimate())
+
+    def _marked(self, estimate: Estimate) -> Estimate:
+        return estimate._replace(flag=np.array([float(self.flagged)]))
 
 
 class Coupled(_Guard):
@@ -113,11 +121,6 @@ class Coupled(_Guard):
         self._paired = 1 if spec.method in ("geometric", "reduced_order") else 0
         self._last: dict[int, tuple[int, Array]] = {}  # for hold: the newest vector and its age
         self._said: deque[Array] = deque(maxlen=MEMORY)  # own vectors, newest first
-
-    @property
-    def flagged(self) -> bool:
-        """Is the newest estimate marked?"""
-        return self._doubt > 0
 
     def sample(self, y: Array, u: Array) -> None:
         """As the method does."""
@@ -182,11 +185,6 @@ class Fused(_Guard):
             self._AB = np.hstack([spec.matrices["A"], spec.matrices["B"]])
         self._x = np.zeros(spec.n)
 
-    @property
-    def flagged(self) -> bool:
-        """Are the newest estimates marked?"""
-        return self._doubt > 0
-
     def sample(self, y: Array, u: Array) -> None:
         """As the method does; the first sample after an estimate begins a step without doubt."""
         if self._results:
@@ -222,14 +220,14 @@ class Fused(_Guard):
 
     def estimate(self) -> Estimate:
         """Of the newest sample."""
-        return self._results[-1] if self.batch() else self._inner.estimate()
+        return self._results[-1] if self.batch() else super().estimate()
 
     def batch(self) -> Sequence[Estimate]:
         """Of every sample since the last rounds."""
         if not self._results and self._inputs:
             doubtful = self._AB is not None and self.flagged
             found = self._predicted() if doubtful else [e.state.copy() for e in reader(self._inner)()]
-            self._results = [Estimate(x) for x in found]
+            self._results = [self._marked(Estimate(x)) for x in found]
         return self._results
 
     def _predicted(self) -> list[Array]:

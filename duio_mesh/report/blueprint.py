@@ -9,7 +9,7 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from duio_mesh.report.entities import DESCRIPTION, EVENTS, GAPS, RATES, STATES, TRUTH, WATCHED, Entities, spread
+from duio_mesh.report.entities import DESCRIPTION, EVENTS, FLAGS, GAPS, RATES, STATES, TRUTH, WATCHED, Entities, spread
 from duio_mesh.report.topology import positions
 
 VIEWS = 12  # states that are shown side by side
@@ -52,11 +52,14 @@ def styles(entities: Entities, description: str) -> Iterator[tuple[str, Any]]:
     lanes = rr.StateConfiguration(values=list(STATES), colors=np.array(list(STATES.values()), dtype=np.uint32))
     for who in ("plant", *(f"node-{i}" for i in entities.ids)):
         yield entities.alive(who), lanes
+    marks = rr.StateConfiguration(values=list(FLAGS), colors=np.array(list(FLAGS.values()), dtype=np.uint32))
+    for i in entities.ids if entities.spec.flags else ():
+        yield entities.flag(i), marks
     yield from _map(entities)
 
 
 def states(values: list[str]) -> Any:
-    """How a process is, as a column of its lane."""
+    """How a process or an estimate is, as a column of its lane."""
     return rr.StateChange.columns(state=values)
 
 
@@ -107,11 +110,13 @@ def _overview(entities: Entities) -> rrb.Container:
         [entities.error(i) for i in entities.ids],
         legend=len(entities.ids) <= LEGEND,
     )
-    lanes = rrb.StateTimelineView(origin="/alive", name="Processes", time_view=_whole_run())
+    lanes = [rrb.StateTimelineView(origin="/alive", name="Processes", time_view=_whole_run())]
+    if entities.spec.flags:
+        lanes.append(rrb.StateTimelineView(origin="/flag", name="Each node about its estimate", time_view=_whole_run()))
     columns = rrb.TextLogColumns(text_log_columns=["LogLevel", "Body"])
     log = rrb.TextLogView(origin=EVENTS, name="Events", columns=columns)
     return rrb.Horizontal(
-        rrb.Vertical(errors, lanes, row_shares=[3, 2]),
+        rrb.Vertical(errors, *lanes, row_shares=[3, 2, 2][: 1 + len(lanes)]),
         rrb.Vertical(_topology(entities), log, row_shares=[3, 2]),
         column_shares=[5, 3],
         name="Overview",

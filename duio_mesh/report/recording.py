@@ -16,6 +16,7 @@ from duio_mesh.report import blueprint as look
 from duio_mesh.report.buffer import ROWS, Buffer
 from duio_mesh.report.conditions import Conditions
 from duio_mesh.report.entities import EVENTS, WATCHED, Column, Entities
+from duio_mesh.report.flags import Flags
 from duio_mesh.report.gaps import Gaps
 from duio_mesh.report.pairing import Decimator, Errors, Pairing, Span, Spans, log_norms, runs
 from duio_mesh.report.streams import Batch, FileStream, LiveStream, Opening
@@ -62,6 +63,7 @@ class Recording:
         self.event(f"{len(entities.ids)} nodes, {spec.n} states, {spec.steps} steps of {spec.step:g} s")
         self._conditions = Conditions(entities, self._send, self.event, self._reached)
         self._gaps = Gaps(entities, self._scalars) if spec.tick else None
+        self._flags = Flags(entities, self._send) if spec.flags else None
 
     @property
     def url(self) -> str | None:
@@ -81,7 +83,8 @@ class Recording:
             self._say(errors)
 
     def estimates(self, node: int, k: int, rows: Array) -> None:
-        """Rows (m, size) of a node for the steps k .. k+m-1: n states, then what else the method estimates.
+        """Rows (m, size) of a node for the steps k .. k+m-1: n states, then what else the method estimates,
+        and where the spec says so its own mark of the estimate (not 0: flagged).
 
         Raises ValueError for a wrong shape or step, KeyError for an unknown node.
         """
@@ -208,7 +211,10 @@ class Recording:
         for first, last in self._seen[source].gaps(k, k + len(rows)):
             steps = np.arange(first, last)
             keep = (steps % stride == 0) | (steps == final)
-            self._states[source].add(steps[keep], rows[first - k : last - k][keep][:, [c for c, _ in columns]])
+            new = rows[first - k : last - k]
+            self._states[source].add(steps[keep], new[keep][:, [c for c, _ in columns]])
+            if self._flags and source is not None:
+                self._flags.rows(source, first, new[:, -1])
         self._seen[source].add(k, k + len(rows))
 
     def _say(self, errors: Errors) -> None:
@@ -221,7 +227,10 @@ class Recording:
         return max((last for _, last in seen), default=0)
 
     def _break_lines(self) -> None:
-        """A NaN at the start of every gap between two rows: a viewer would join the rows with a line."""
+        """A NaN at the start of every gap between two rows: a viewer would join the rows with a line. Lanes end too."""
+        if self._flags:
+            for i in self._entities.ids:
+                self._flags.gaps(i, [first for first, _ in self._seen[i].gaps(0, self._spec.steps)])
         for i, known in self._pairing.known.items():
             at = _inner_gaps(known)
             self._errors[i].add(at, np.full((len(at), 1), np.nan))

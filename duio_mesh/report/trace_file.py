@@ -72,6 +72,7 @@ def _check(path: Path, trace: Trace, unknown: list[str]) -> None:
             ("t", trace.t, trace.t.shape == (K,)),
             ("xhat", trace.xhat, trace.xhat.shape == (N, K, n)),
             ("what", trace.what, trace.what is None or trace.what.shape[:2] == (N, K)),
+            ("flagged", trace.flagged, trace.flagged is None or trace.flagged.shape == (N, K)),
             *((f"{_VHAT}{i}", v, v.shape[:1] == (K,) and i in trace.node_ids) for i, v in trace.vhat.items()),
             *((f"{_SAMPLE}{i}", s, s.shape[:1] == (K,) and i in trace.node_ids) for i, s in trace.samples.items()),
         )

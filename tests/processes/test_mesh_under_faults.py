@@ -45,7 +45,7 @@ def same(design: Any) -> duio_mesh.RunResult:
         assert found[array].tobytes() == values.tobytes(), array
     assert oracle.flagged is not None
     counted = {str(i): int(flags.sum()) for i, flags in zip(oracle.node_ids, oracle.flagged, strict=True)}
-    assert result.metrics["flagged"] == counted
+    assert {i: node["flagged"] for i, node in result.metrics["nodes"].items()} == counted
     assert sum("flags" in warning for warning in result.warnings) == sum(count > 0 for count in counted.values())
     return result
 

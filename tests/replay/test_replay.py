@@ -64,7 +64,7 @@ def test_every_node_of_every_method_to_the_same_bits(
             assert rows["xhat"].tobytes() == result.trace.xhat[at].tobytes()
             if i in result.trace.vhat:
                 assert rows["vhat"].tobytes() == result.trace.vhat[i].tobytes()
-            assert rows["flagged"].sum() == result.metrics.get("flagged", {}).get(str(i), 0)
+            assert rows["flagged"].sum() == result.metrics["nodes"][str(i)].get("flagged", 0)
 
 
 def test_a_node_that_was_killed_is_replayed_as_far_as_it_went(capsys: pytest.CaptureFixture[str]) -> None:
