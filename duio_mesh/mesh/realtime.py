@@ -4,9 +4,9 @@ The plant sends a sample per tick. All rounds of a step together may wait for ``
 the step's sample arrived here; clocks of other hosts do not matter. Everything that this node hears comes through one
 queue with the time of its arrival, so a wait is one timed wait on that queue, whatever it is for.
 
-Zenoh delivers what one process sends in the order in which it was sent. So a frame that is newer than the one that is
-due says that the latter will not come, and a neighbour that is more than a step behind (it was stopped, or is slow) is
-not waited for until it has caught up: it costs the others one deadline, not one per step.
+Zenoh delivers what one process sends in the order in which it was sent, so a frame that is newer than the one that is
+due says that the latter will not come. And a neighbour that was waited for in vain in two steps in a row (it was
+stopped, or is slow) is not waited for again before it has caught up: it costs the others two deadlines, not one a step.
 """
 
 from __future__ import annotations
@@ -33,6 +33,7 @@ At: TypeAlias = tuple[int, int]
 """(step, round)"""
 
 GONE, BACK = b"gone", b"back"
+VAIN = 2  # steps in a row in which a neighbour is waited for until the deadline
 BEFORE = (-1, 0)
 
 
@@ -43,6 +44,7 @@ class Link(Source):
         super().__init__(name, who, Decoder(mesh.keys.run, who))
         self.waiting: dict[At, tuple[float, Array]] = {}
         """Frames that are not due yet, and when they arrived."""
+        self.vain = 0  # steps that it was waited for in vain since it was last heard of the step before, or a newer one
         inbox.links.append(self)
         mesh.sources.append(self)
         put = inbox.put
@@ -237,6 +239,8 @@ class Realtime:
             self._mesh.reject(link, "too far ahead")
         else:
             link.last = (k, r)
+            if k >= self._sampled[0] - 1:
+                link.vain = 0
             if (k, r) > done:
                 link.waiting[k, r] = (arrived, vector)
             elif link is not self._plant:
@@ -254,7 +258,7 @@ class Realtime:
     def _awaited(self, due: Sequence[int], k: int, r: int) -> bool:
         """Whether one of these neighbours may still answer in time."""
         links = (self._heard[j] for j in due)
-        return any((k - 1, 0) <= link.newest < (k, r) and not link.gone for link in links)
+        return any(link.newest < (k, r) and link.vain < VAIN and not link.gone for link in links)
 
     def _fits(self, stamp: Stamp, vector: Array) -> bool:
         """Whether a vector has the size of our own of that round; one that has not is refused."""
@@ -292,6 +296,8 @@ class Realtime:
             return
         self._closed = self._sampled
         self._clock.end()
+        for j in self._absent:
+            self._heard[j].vain += self._heard[j].newest < (self._done[0], 0)
         self._note([np.array([len(self._absent)], dtype=np.float64)])
         self._absent.clear()
         while self._excused and next(iter(self._excused)).k < self._done[0] - self._window:
