@@ -9,6 +9,7 @@ import numpy as np
 from duio_mesh.errors import DuioError
 from duio_mesh.replay.compare import Difference, Kept, difference
 from duio_mesh.replay.player import Block
+from duio_mesh.replay.tables import in_words
 from duio_mesh.spec import NodeSpec
 from duio_mesh.tape import Head, ingredients
 
@@ -89,7 +90,7 @@ class Outcome:
     def _say_unfinished(self, block: Block, say: Say) -> None:
         steps = block.steps
         where = f"step {block.first}" if len(steps) < 2 else f"steps {block.first} to {steps[-1]}"
-        where += f", after {block.exchanged} exchanges"
+        where += f", after {in_words(block.exchanged)}"
         if block.failure is None:
             say(f"the tape of process {block.head.incarnation + 1} of node {self._spec.id} ends in {where}")
             return

@@ -21,7 +21,7 @@ Say = Callable[[str], None]
 def show_block(say: Say, spec: NodeSpec, block: Block, k: int, r: int | None, run: Kept | None) -> None:
     """Print step k of this block; ``r``: the exchange that is wanted, or None."""
     together = f", fused with steps {block.first} to {block.steps[-1]}" if len(block.steps) > 1 else ""
-    say(f"node {spec.id}, step {k}: {spec.method}, {block.exchanged} exchanges{together}")
+    say(f"node {spec.id}, step {k}: {spec.method}, {in_words(block.exchanged)}{together}")
     for call in block.calls:
         said = ", ".join(f"[{_numbers(a)}]" if isinstance(a, np.ndarray) else str(a) for a in call.arguments)
         say(f"  told before: {call.name}({said})")
@@ -39,6 +39,11 @@ def show_block(say: Say, spec: NodeSpec, block: Block, k: int, r: int | None, ru
     _show(say, _estimate(block, k, run))
     if block.flagged:
         say("  the observer marks this estimate: messages were missing that it needs")
+
+
+def in_words(exchanges: int) -> str:
+    """How many there were."""
+    return "1 exchange" if exchanges == 1 else f"{exchanges} exchanges"
 
 
 def _exchange(spec: NodeSpec, one: Round) -> Iterator[Sequence[str]]:

@@ -16,6 +16,7 @@ import duio_mesh
 from duio_mesh import cli
 from duio_mesh.arrays import contiguous
 from duio_mesh.observers import make_observer
+from duio_mesh.replay import command
 from duio_mesh.replay.player import play
 from duio_mesh.spec import NodeSpec, read_spec, write_spec
 from duio_mesh.tape import read_tape, taped
@@ -48,14 +49,16 @@ def replay(*options: str, node: int = 3, folder: str = "run") -> int:
         ("reduced_order_kundur8", {}),  # reconstructs w and v
         ("ring", {"faults": LOSSES}),
         ("finite_time_ring", {"faults": LOSSES, "observer.setup": "global", "run.batch": 3}),
+        ("star", {"timing": {"mode": "realtime", "tick": 0.01}}),  # who is late is decided by the clock, once
     ],
-    ids=lambda value: value if isinstance(value, str) else "faults" if "faults" in value else "",
+    ids=lambda value: value if isinstance(value, str) else "-".join(value),
 )
 def test_every_node_of_every_method_to_the_same_bits(
-    name: str, changes: dict[str, Any], capsys: pytest.CaptureFixture[str]
+    name: str, changes: dict[str, Any], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     design, result = run(name, 40, **changes)
     capsys.readouterr()
+    monkeypatch.setattr(command, "PATIENCE", 0.0)  # the progress bar, too
     for i in design.nodes:
         assert replay("--out", f"{i}.npz", node=i) == 0
         assert f"node {i} ({design.scenario.method}): 40 steps are equal to trace.npz" in capsys.readouterr().out
