@@ -4,15 +4,16 @@ The error of node i at step k is the RMS over the components of x-hat_i(k) - x(k
 
 - its *former level* is the RMS of that error over the last WINDOW steps before a (those of them that it estimated);
   it counts as at least ROUNDING times the RMS of the states there, because an error of rounding alone has no level;
-- it is *back* at the first step k at which the error is at most TWICE that level, and the RMS of the error over
-  the WINDOW steps from k on is so too (an error that only passes through zero is not back);
+- it is *back* at the first step k at which the error is at most TWICE that level, and the RMS of what it has
+  estimated in the WINDOW steps from k on is so too (an error that only passes through zero is not back);
 - the number of steps is k - b, counted from the return of the node that was lost, or k - a if it never returned.
 
-None: there was no level, or it was not back in the run (WINDOW whole steps of it, all estimated).
+None: there was no level, or it was not back WINDOW steps before the end of the run.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -48,6 +49,18 @@ def recovery(trace: Trace) -> list[dict[str, Any]]:
     return found
 
 
+def loss_in_words(loss: Mapping[str, Any]) -> str:
+    """One entry of ``recovery`` as a sentence."""
+    a, b = loss["lost"]
+    when = f"was away in steps {a} to {b - 1}" if loss["returned"] else f"is gone from step {a} on"
+    steps = {i: "never" if k is None else "at once" if k == 0 else f"after {k}" for i, k in loss["steps"].items()}
+    if not loss["returned"]:
+        del steps[str(loss["node"])]
+    each = ", ".join(f"node {i} {words}" for i, words in steps.items())
+    since = "the return" if loss["returned"] else "the loss"
+    return f"node {loss['node']} {when}; steps from {since} until errors are under twice what they were: {each}"
+
+
 def _mean_squares(vectors: Array) -> Array:
     """Mean over the last axis of the squares; an overflow is infinite."""
     with np.errstate(over="ignore", invalid="ignore"):
@@ -68,7 +81,11 @@ def _steps(squares: Array, after: Array, states: Array, at: Span) -> int | None:
 
 
 def _windows(squares: Array) -> Array:
-    """(K - WINDOW + 1,) means over the WINDOW values from each on; NaN where one of them is missing."""
+    """(K - WINDOW + 1,) means over those of the WINDOW values from each on that there are; 0 where there is none."""
     if len(squares) < WINDOW:
         return np.zeros(0)
-    return np.asarray(np.mean(sliding_window_view(squares, WINDOW), axis=1))
+    there = ~np.isnan(squares)
+    sums, counts = (
+        sliding_window_view(values, WINDOW).sum(axis=1) for values in (np.where(there, squares, 0.0), there)
+    )
+    return np.asarray(sums / np.maximum(counts, 1))
