@@ -45,11 +45,11 @@ def untimely(timing: Mapping[str, Any], steps: int) -> list[str]:
             f"{nodes[i]['missing']} not at all"
         )
     if len(worst) > FEW:
-        found.append(f"so did {len(worst) - FEW} more nodes, without {absent[worst[FEW]]:.0%} and less")
+        found.append(f"and so did {len(worst) - FEW} more nodes, without {absent[worst[FEW]]:.0%} or less")
     slow = {i: f["overruns"] for i, f in nodes.items() if f["overruns"] > NOTICEABLE * steps}
     if slow:
         who = max(slow, key=slow.__getitem__)
-        others = f", and so did {len(slow) - 1} other nodes, less often" if len(slow) > 1 else ""
+        others = f", and so did {len(slow) - 1} more" if len(slow) > 1 else ""
         found.append(f"node-{who} needed more than a tick for {slow[who]} of {steps} steps{others}")
     return found
 
