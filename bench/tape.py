@@ -26,7 +26,7 @@ from duio_mesh.observers.base import reader
 from duio_mesh.replay.player import play
 from duio_mesh.spec import NodeSpec, read_spec
 from duio_mesh.synthesis.design import Design
-from duio_mesh.tape import read_tape, taped
+from duio_mesh.tape import Tape, read_tape
 
 HOME = Path(__file__).parent.parent
 
@@ -53,7 +53,8 @@ def rounds_per_second(design: Design, played: list[float]) -> float:
 def microseconds_per_round(spec: NodeSpec) -> tuple[float, float]:
     """(processor time of this thread, bytes of tape) per round of one observer alone."""
     y, u, rounds = np.ones(spec.p), np.ones(spec.m), 0
-    with taped(make_observer(spec), spec) as observer:
+    with Tape(spec) as tape:
+        observer = tape.follow(make_observer(spec))
         read, begin = reader(observer), time.thread_time()
         for _ in range(spec.steps):
             observer.sample(y, u)

@@ -31,15 +31,16 @@ from duio_mesh.observers.base import reader
 from duio_mesh.observers.watch import watcher
 from duio_mesh.process import Report, main
 from duio_mesh.spec import NodeSpec
+from duio_mesh.tape import Tape
 
 NO_VECTOR = np.zeros(0)
 BEAT = 0.5  # seconds between signs of life inside a step
-from duio_mesh.tape import taped
 
 
 def run(spec: NodeSpec, report: Report) -> None:
     """Run one node for ``spec.steps`` steps. Raises RunError when a neighbour or the plant is lost or late."""
-    with taped(make_observer(spec), spec) as observer, Mesh(spec.wire, f"node-{spec.id}", report.warn) as mesh:
+    with Tape(spec) as tape, Mesh(spec.wire, f"node-{spec.id}", report.warn) as mesh:
+        observer = tape.follow(make_observer(spec))
         row = sum(part.size for part in observer.estimate())
         links = Links(spec, mesh, observer)
         mesh.watch(links.lockstep.noticed)

@@ -112,30 +112,36 @@ def ingredients(spec: NodeSpec) -> dict[str, str]:
 
 
 class Tape:
-    """Writes records; a context manager that flushes and closes."""
+    """The tape of one process, where its spec asks for one; a context manager that flushes and closes."""
 
-    def __init__(self, path: Path, head: Head) -> None:
-        """Begin a tape, or go on with the one that an earlier process of this node left. Mode 0600, like a spec.
+    def __init__(self, spec: NodeSpec) -> None:
+        """Begin a tape, or go on with the one that an earlier process of this node left. Mode 0600, like the spec.
 
         Raises ValueError when the file is not a tape, OSError when it cannot be written.
         """
-        path.parent.mkdir(parents=True, exist_ok=True)
-        self._file = os.fdopen(os.open(path, os.O_RDWR | os.O_CREAT, 0o600), "r+b")
-        try:
-            _repair(self._file, path)
-        except BaseException:
-            self._file.close()
-            raise
+        self._spec = spec
+        self._file = _open(Path(spec.inputs)) if spec.inputs else None
         self._pack = msgpack.Packer().pack
         self._buffer, self._due = bytearray(), 0.0
-        self.write((_Kind.HEAD, MAGIC, VERSION, *head[:4], dict(head.made)))  # due at once: there is always a head
+
+    def follow(self, observer: Observer, first: int = 0, incarnation: int = 0) -> Observer:
+        """The observer, each of whose calls is noted from now on; without a tape the observer itself.
+
+        ``first``: the step of the first ``sample`` to come; ``incarnation``: how many processes of this node, which
+        wrote to the same file, there were before this one.
+        """
+        if self._file is None:
+            return observer
+        spec = self._spec
+        return Taped(observer, self, Head(spec.id, incarnation, first, spec.steps - first, ingredients(spec)))
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
         self.flush()
-        self._file.close()
+        if self._file:
+            self._file.close()
 
     def write(self, record: tuple[Any, ...]) -> None:
         """Append a record of plain data."""
@@ -146,7 +152,7 @@ class Tape:
     def flush(self) -> None:
         """Hand a chunk to the operating system, where it outlives this process."""
         self._due = time.monotonic() + PERIOD
-        if self._buffer:
+        if self._buffer and self._file:
             self._file.write(_CHUNK.pack(*_chunk_of(self._buffer)) + self._buffer)
             self._file.flush()
             self._buffer.clear()
@@ -155,10 +161,12 @@ class Tape:
 class Taped:
     """An observer with a tape: each call is written down, then carried out by the observer itself."""
 
-    def __init__(self, inner: Observer, tape: Tape) -> None:
-        self._inner, self._write = inner, tape.write
+    def __init__(self, inner: Observer, tape: Tape, head: Head) -> None:
+        """``head`` is written with the first call, so that an observer that is never used leaves nothing."""
+        self._inner, self._tape, self._head = inner, tape, head
+        self._write = self._begin
         self._sample, self._exchange = inner.sample, inner.exchange
-        self._unread = False  # samples since the estimates were last read
+        self._unread, self._r = False, -1  # since the estimates were last read: whether there are samples; last round
         self.message = inner.message
 
     @property
@@ -168,12 +176,13 @@ class Taped:
 
     def sample(self, y: Array, u: Array) -> None:
         """As the observer does."""
-        self._unread = True
+        self._unread, self._r = True, -1
         self._write((_Kind.SAMPLE, _bytes(y), _bytes(u)))
         self._sample(y, u)
 
     def exchange(self, r: int, received: Mapping[int, Array]) -> None:
         """As the observer does."""
+        self._r = r
         self._write((_Kind.EXCHANGE, r, {j: _bytes(vector) for j, vector in received.items()}))
         self._exchange(r, received)
 
@@ -202,8 +211,16 @@ class Taped:
             return partial(self._called, name, inner)
         raise TypeError(f"a tape has no record for the observer's call {name!r}; name it in duio_mesh.tape.CALLS")
 
+    def _begin(self, record: tuple[Any, ...]) -> None:
+        """Write the first record, after the head."""
+        head = self._head
+        self._write = self._tape.write
+        self._write((_Kind.HEAD, MAGIC, VERSION, *head[:4], dict(head.made)))
+        self._write(record)
+
     def _note_reading(self) -> None:
-        if self._unread:
+        """Only what is read after the last round is new; who asks for an estimate in between gets an old one."""
+        if self._unread and self._r + 1 >= self._inner.rounds:
             self._unread = False
             self._write((_Kind.READ,))
 
@@ -219,22 +236,6 @@ class Taped:
         plain = [_bytes(a) if isinstance(a, np.ndarray) else int(a) for a in arguments]
         self._write((_Kind.CALL, name, plain))
         inner(*arguments)
-
-
-@contextlib.contextmanager
-def taped(observer: Observer, spec: NodeSpec, first: int = 0, incarnation: int = 0) -> Iterator[Observer]:
-    """The observer, with a tape in ``spec.inputs`` where that names a file; itself otherwise.
-
-    ``spec`` is as the process was given it. ``first``: the step of the first ``sample`` to come; ``incarnation``: how
-    many processes of this node there were before this one, which wrote to the same file. Raises ValueError when the
-    file holds something else, and OSError.
-    """
-    if not spec.inputs:
-        yield observer
-        return
-    head = Head(spec.id, incarnation, first, spec.steps - first, ingredients(spec))
-    with Tape(Path(spec.inputs), head) as tape:
-        yield Taped(observer, tape)
 
 
 def read_tape(path: Path) -> Iterator[Record]:
@@ -296,6 +297,18 @@ def _records(file: BinaryIO, path: Path) -> _Chunk:
     if complete and used != length:
         raise ValueError(f"{path} is damaged after byte {begin + _CHUNK.size + used}: half a record")
     return _Chunk(whole, used)
+
+
+def _open(path: Path) -> BinaryIO:
+    """The file, made if need be, for a process to go on at its end."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    file = os.fdopen(os.open(path, os.O_RDWR | os.O_CREAT, 0o600), "r+b")
+    try:
+        _repair(file, path)
+    except BaseException:
+        file.close()
+        raise
+    return file
 
 
 def _repair(file: BinaryIO, path: Path) -> None:

@@ -19,7 +19,7 @@ from duio_mesh.observers import make_observer
 from duio_mesh.replay import command
 from duio_mesh.replay.player import play
 from duio_mesh.spec import NodeSpec, read_spec, write_spec
-from duio_mesh.tape import read_tape, taped
+from duio_mesh.tape import Tape, read_tape
 from tests.conftest import ROOT, TOPOLOGIES
 from tests.processes.running import Running
 
@@ -147,6 +147,9 @@ def test_what_is_wrong_with_a_folder_is_said(capsys: pytest.CaptureFixture[str])
     assert "node-3.spec is not a spec file" in said(2)
     write_spec(true, spec)
     assert "60 steps are equal" in said(0)
+    trace = Path("run/trace.npz").read_bytes()
+    Path("run/trace.npz").write_bytes(trace[: len(trace) // 2])
+    assert "trace.npz is not a trace" in said(2)
     Path("run/trace.npz").unlink()
     assert "nothing to compare them with" in said(2)
     assert replay(folder="nowhere") == 2
@@ -171,14 +174,15 @@ def test_a_process_that_joins_later_begins_anew() -> None:
     spec = replace(duio_mesh.synthesise(scenario).nodes[1], inputs="node-1.tape")
     random, ran = np.random.default_rng(5), []
     for incarnation, (first, stop) in enumerate([(0, 8), (12, 23)]):
-        with taped(make_observer(replace(spec, steps=23 - first)), spec, first, incarnation) as observer:
+        with Tape(spec) as tape:
+            observer: Any = tape.follow(make_observer(replace(spec, steps=23 - first)), first, incarnation)
             for k in range(first, stop, 4):
                 for _ in range(k, min(k + 4, stop)):
                     observer.sample(random.normal(size=spec.p), random.normal(size=spec.m))
                 for r in range(observer.rounds):
                     size = observer.message(r).size
                     observer.exchange(r, {j: random.normal(size=size) for j in sorted(spec.hears)})
-                ran += [e.state.tobytes() for e in observer.batch()]  # type: ignore[attr-defined]
+                ran += [e.state.tobytes() for e in observer.batch()]
     blocks = list(play(spec, read_tape(Path("node-1.tape"))))
     assert [k for block in blocks for k in block.steps] == [*range(8), *range(12, 23)]
     assert [e.state.tobytes() for block in blocks for e in block.estimates] == ran
@@ -193,7 +197,8 @@ def test_the_input_that_made_an_observer_fail_is_there() -> None:
     spec = duio_mesh.synthesise(duio_mesh.load_scenario(TOPOLOGIES / "finite_time_ring.yaml")).nodes[1]
     assert spec.options["setup"] == "distributed"
     spec = replace(spec, inputs="node-1.tape")
-    with taped(make_observer(spec), spec) as observer:
+    with Tape(spec) as tape:
+        observer = tape.follow(make_observer(spec))
         observer.sample(np.ones(spec.p), np.ones(spec.m))
         with pytest.raises(duio_mesh.RunError, match="no message"):
             observer.exchange(0, {})

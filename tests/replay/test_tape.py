@@ -19,11 +19,29 @@ from duio_mesh import tape as tapes
 from duio_mesh.arrays import Array
 from duio_mesh.observers.absence import Late, flagged, take_late
 from duio_mesh.observers.base import Estimate, reader
-from duio_mesh.tape import Arrival, Call, Exchange, Head, Read, Record, Sample, Tape, Taped, read_tape, taped
+from duio_mesh.spec import NodeSpec
+from duio_mesh.tape import Arrival, Call, Exchange, Head, Read, Record, Sample, Tape, ingredients, read_tape
 from tests.conftest import TOPOLOGIES
 
-HEAD = Head(3, 0, 0, 100, {"run": "a run"})
 PATH = Path("inputs/node-3.tape")
+SPEC = NodeSpec(
+    id=3,
+    method="none",
+    n=1,
+    p=1,
+    m=1,
+    matrices={},
+    options={},
+    hears={},
+    tells=(),
+    steps=100,
+    deadline=1.0,
+    window=1,
+    credit=1,
+    block=1,
+    batch=1,
+    inputs=str(PATH),
+)
 
 
 class Diary:
@@ -92,42 +110,49 @@ calls = st.one_of(
 def test_what_an_observer_is_given_is_what_is_read(said: list[Any]) -> None:
     PATH.unlink(missing_ok=True)
     diary = Diary()
-    with Tape(PATH, HEAD) as tape:
-        observer = Taped(diary, tape)
+    with Tape(SPEC) as tape:
+        observer = tape.follow(diary)
         for name, *arguments in said:
             getattr(observer, name)(*arguments)
+    if not said:
+        assert PATH.read_bytes() == b""
+        return
     head, *records = read_tape(PATH)
-    assert head == HEAD
+    assert head == Head(3, 0, 0, 100, ingredients(SPEC))
     assert again(records) == diary.given
     assert len(records) == len(diary.given) == len(said)
 
 
 def test_everything_else_is_the_observers_own() -> None:
     diary = Diary()
-    with Tape(PATH, HEAD) as tape:
-        observer = Taped(diary, tape)
+    with Tape(SPEC) as tape:
+        observer = tape.follow(diary)
         observer.estimate()  # before any sample nothing is read
         observer.sample(np.ones(2), np.zeros(0))
         assert observer.rounds == 1
         assert observer.message(7) == [7.0]
         assert flagged(observer)
         take_late(observer, [])  # nothing: not a call
+        observer.estimate()  # somebody wants to know in the middle of the step: nothing new is read
+        observer.exchange(0, {})
         assert reader(observer)()[0].state == [0.0]
         observer.estimate()  # of the same sample: not a second step
-    assert [type(record) for record in read_tape(PATH)] == [Head, Sample, Read]
+    assert [type(record) for record in read_tape(PATH)] == [Head, Sample, Exchange, Read]
 
 
 def test_a_call_that_the_tape_does_not_know_is_refused_before_it_is_made() -> None:
     """Left out, it would make a tape that does not lead to the same bits."""
-    with Tape(PATH, HEAD) as tape, pytest.raises(TypeError, match=r"no record for the observer's call 'reset'"):
-        Taped(Diary(), tape).reset()
+    with Tape(SPEC) as tape:
+        observer: Any = tape.follow(Diary())
+        with pytest.raises(TypeError, match=r"no record for the observer's call 'reset'"):
+            observer.reset()
 
 
 def written(steps: int, monkeypatch: pytest.MonkeyPatch, full: int = 200) -> bytes:
     """A tape of several chunks."""
     monkeypatch.setattr(tapes, "FULL", full)
-    with Tape(PATH, HEAD) as tape:
-        observer = Taped(Diary(), tape)
+    with Tape(SPEC) as tape:
+        observer = tape.follow(Diary())
         for k in range(steps):
             observer.sample(np.array([k, 0.5]), np.array([1.0]))
             observer.exchange(0, {1: np.full(3, k), 2: np.zeros(3)})
@@ -158,11 +183,12 @@ def test_cut_short_anywhere_it_has_its_whole_records(monkeypatch: pytest.MonkeyP
 def test_a_new_process_goes_on_where_the_old_one_was_cut_short(monkeypatch: pytest.MonkeyPatch) -> None:
     data = written(4, monkeypatch)
     everything = list(map(repr, read_tape(PATH)))
-    second = Head(3, 1, 40, 60, {})
+    second = Head(3, 1, 40, 60, ingredients(SPEC))
     for size in range(len(data) + 1):
         PATH.write_bytes(data[:size])
-        with Tape(PATH, second) as tape:
-            Taped(Diary(), tape).sample(np.ones(1), np.ones(1))
+        with Tape(SPEC) as tape:
+            tape.follow(Diary()).estimate()  # one that is given nothing leaves nothing
+            tape.follow(Diary(), 40, 1).sample(np.ones(1), np.ones(1))
         found = list(map(repr, read_tape(PATH)))
         assert found[:-2] == everything[: whole(data[:size])]
         assert found[-2] == repr(second)
@@ -186,7 +212,7 @@ def test_a_flipped_bit_never_gives_another_record(monkeypatch: pytest.MonkeyPatc
 
 
 def test_only_its_owner_can_read_it() -> None:
-    with Tape(PATH, HEAD):
+    with Tape(SPEC):
         assert stat.S_IMODE(PATH.stat().st_mode) == 0o600
 
 
@@ -194,13 +220,13 @@ def test_a_file_that_is_something_else_is_not_touched() -> None:
     PATH.parent.mkdir()
     PATH.write_bytes(b"precious and certainly not a tape")
     with pytest.raises(ValueError, match="is not a tape, or is damaged at byte 0"):
-        Tape(PATH, HEAD)
+        Tape(SPEC)
     assert PATH.read_bytes() == b"precious and certainly not a tape"
 
 
 def test_a_tape_of_another_format_says_so() -> None:
-    with Tape(PATH, HEAD):
-        pass
+    with Tape(SPEC) as tape:
+        tape.follow(Diary()).sample(np.ones(1), np.ones(1))
     data = PATH.read_bytes()
     record = msgpack.packb([1, tapes.MAGIC, tapes.VERSION + 1, 3, 0, 0, 100, {}])
     PATH.write_bytes(
@@ -213,6 +239,6 @@ def test_a_tape_of_another_format_says_so() -> None:
 def test_it_costs_nothing_when_it_is_not_asked_for() -> None:
     design = duio_mesh.synthesise(duio_mesh.load_scenario(TOPOLOGIES / "admm_ring.yaml"))
     diary = Diary()
-    with taped(diary, design.nodes[1]) as observer:
-        assert observer is diary
+    with Tape(design.nodes[1]) as tape:
+        assert tape.follow(diary) is diary
     assert list(Path().iterdir()) == []
