@@ -13,13 +13,14 @@ from __future__ import annotations
 import argparse
 import statistics
 from functools import partial
+from typing import TYPE_CHECKING
 
-import rings
 import rivals
 from interleave import Contenders, interleaved, machine, table
 from processes import memories
 
-from duio_mesh.launcher import Progress
+if TYPE_CHECKING:
+    from duio_mesh.launcher import Progress
 
 REFERENCE = "bare Zenoh"
 ROUNDS = 199  # exchanges per step of the project's ring
@@ -28,6 +29,8 @@ MPI_SHARE = 10  # MPI spins while it waits: with more processes than cores it ge
 
 def contenders(count: int, rounds: int, size: int) -> Contenders:
     """Everybody's measurement for a ring of ``count`` processes."""
+    import rings  # not at the top: every process of a rival imports this module
+
     ring = rings.admm_ring(count, max(1, rounds // ROUNDS), {"nu": ROUNDS + 1})
     found = {
         REFERENCE: partial(rivals.bare_zenoh, count, rounds, size),
@@ -46,6 +49,8 @@ def contenders(count: int, rounds: int, size: int) -> Contenders:
 
 def node_memory(count: int) -> float:
     """PSS of a node process in MB while the ring runs, the median over its nodes."""
+    import rings
+
     sizes: list[float] = []
 
     def look(progress: Progress) -> None:
