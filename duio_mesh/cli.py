@@ -53,7 +53,7 @@ def parser() -> argparse.ArgumentParser:
     how = p.add_mutually_exclusive_group()
     how.add_argument("--in-process", action="store_true", help="the oracle: one process, no Zenoh, the same bits")
     how.add_argument("--check", action="store_true", help="validate, check the theory, design, start nothing")
-    how.add_argument("--dry-run", action="store_true", help="print what would be started")
+    how.add_argument("--dry-run", action="store_true", help="print what would be started; with --out keep the design")
     p.add_argument(
         "--contingency",
         type=int,
@@ -79,6 +79,10 @@ def parser() -> argparse.ArgumentParser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; the exit code."""
     argv = sys.argv[1:] if argv is None else argv
+    if argv and argv[0] in ("export", "gather"):
+        from duio_mesh.deploy import command as deploy
+
+        return deploy.main(argv)
     if list(argv[:1]) == ["new"]:
         from duio_mesh.generate import command
 
@@ -137,6 +141,10 @@ def _main(args: argparse.Namespace) -> int:
             return CONVERGED
         if args.dry_run:
             console.plan(design, record=not args.no_record)
+            if args.out:
+                from duio_mesh.deploy.stored import write_design
+
+                print(f"design     {write_design(design, args.out)}")
             return CONVERGED
         result = _run(design, args, supervisor)
     console.result(design, result, live=args.live)

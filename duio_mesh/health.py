@@ -11,16 +11,24 @@ import sys
 from pathlib import Path
 
 from duio_mesh.mesh.probe import alive
-from duio_mesh.spec import AnySpec, NodeSpec, PlantSpec, RecorderSpec, RouterSpec, read_spec
+from duio_mesh.spec import NodeSpec, PlantSpec, RecorderSpec, RouterSpec, Wire, read_spec
 
 TIMEOUT = 3.0  # seconds for connection and answer
-KINDS: dict[str, type[AnySpec]] = {
-    "node": NodeSpec,
-    "plant": PlantSpec,
-    "recorder": RecorderSpec,
-    "router": RouterSpec,
-}
 ALIVE, NOT_ALIVE, UNUSABLE = 0, 1, 2
+
+
+def wire_of(path: Path) -> Wire:
+    """The wire in the spec of any process. Raises ValueError, or OSError, when that is none."""
+    match path.stem.split("-")[0]:
+        case "node":
+            return read_spec(path, NodeSpec).wire
+        case "plant":
+            return read_spec(path, PlantSpec).wire
+        case "recorder":
+            return read_spec(path, RecorderSpec).wire
+        case "router":
+            return read_spec(path, RouterSpec).wire
+    raise ValueError("its name should begin with node, plant, recorder or router")
 
 
 def main() -> int:
@@ -31,9 +39,8 @@ def main() -> int:
     args = parser.parse_args()
     who = args.spec.stem
     try:
-        wire = read_spec(args.spec, KINDS[who.split("-")[0]]).wire
-        seen = alive(wire, who, args.timeout)
-    except (KeyError, OSError, ValueError) as e:
+        seen = alive(wire_of(args.spec), who, args.timeout)
+    except (OSError, ValueError) as e:
         print(f"{args.spec}: not the spec of a process: {e}", file=sys.stderr)
         return UNUSABLE
     print(f"{who} is {'alive' if seen else 'not to be seen'}")

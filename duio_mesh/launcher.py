@@ -30,7 +30,7 @@ from duio_mesh.simulation import Trace, estimate_sizes, reconstructs, simulate
 from duio_mesh.spec import NodeSpec, PlantSpec, RecorderSpec, write_spec
 from duio_mesh.supervisor import Supervisor
 from duio_mesh.synthesis.design import Design
-from duio_mesh.wiring import LOOPBACK, Wiring, check_address
+from duio_mesh.wiring import LOOPBACK, Wired, Wiring, check_address
 
 CLOSING = 10.0  # seconds for the recorder to fill gaps and close its file ...
 CLOSING_ROWS = 50_000  # ... and a second more for every so many rows
@@ -87,12 +87,13 @@ class Launch:
         record: bool,
         live: bool,
         address: str = LOOPBACK,
+        wiring: Wired | None = None,
     ) -> None:
         self._design, self._folder, self._supervisor = design, folder, supervisor
         self._record, self._live = record, live
         self._sizes = estimate_sizes(design)
         self._url = ""  # of the live server, once the recorder has said it
-        self._wiring = Wiring(design, folder.keys, record=record, address=address)
+        self._wiring = wiring or Wiring(design, folder.keys, record=record, address=address)
 
     def specs(self) -> dict[str, NodeSpec | PlantSpec | RecorderSpec]:
         """Every process' spec, with endpoints that are reserved for it."""

@@ -16,7 +16,7 @@ SINGLE = ("plant", "recorder")
 _NAME = re.compile(
     r"(?=.{1,253}$)[A-Za-z0-9]([A-Za-z0-9-]{0,61}[A-Za-z0-9])?(\.[A-Za-z0-9]([A-Za-z0-9-]{0,61}[A-Za-z0-9])?)*"
 )
-_LABEL = re.compile(r"[a-z0-9]([a-z0-9-]{0,38}[a-z0-9])?")  # it becomes part of the names of containers and routers
+_LABEL = re.compile(r"[a-z0-9]([a-z0-9-]{0,28}[a-z0-9])?")  # it becomes part of the names of containers and routers
 
 
 def read_hosts(
@@ -42,7 +42,7 @@ def read_hosts(
     for at, (name, host) in enumerate(hosts.items()):
         path = (*HOSTS, name)
         if not _LABEL.fullmatch(name):
-            problems.at_key(path, "a host's name should be lower-case letters, digits and '-', at most 40")
+            problems.at_key(path, "a host's name should be lower-case letters, digits and '-', at most 30")
         via = _via(name, host, list(hosts)[:at], routed, problems)
         listen = _addresses(host, path, problems)
         count = 1 if routed else len(host.runs)
