@@ -60,13 +60,17 @@ def test_every_node_of_every_method_to_the_same_bits(
     capsys.readouterr()
     monkeypatch.setattr(command, "PATIENCE", 0.0)  # the progress bar, too
     for i in design.nodes:
+        at = list(result.trace.node_ids).index(i)
+        there = np.flatnonzero(~np.isnan(result.trace.xhat[at]).any(axis=1))
+        assert len(there) == 40 or "nodes" in changes.get("faults", {})
         assert replay("--out", f"{i}.npz", node=i) == 0
-        assert f"node {i} ({design.scenario.method}): 40 steps are equal to trace.npz" in capsys.readouterr().out
+        equal = f"node {i} ({design.scenario.method}): {len(there)} steps are equal to trace.npz"
+        assert equal in capsys.readouterr().out
         with np.load(f"{i}.npz", allow_pickle=False) as rows:  # the comparison itself, made again by other means
-            at = list(result.trace.node_ids).index(i)
-            assert rows["xhat"].tobytes() == result.trace.xhat[at].tobytes()
+            assert list(rows["step"]) == list(there)
+            assert rows["xhat"].tobytes() == result.trace.xhat[at, there].tobytes()
             if i in result.trace.vhat:
-                assert rows["vhat"].tobytes() == result.trace.vhat[i].tobytes()
+                assert rows["vhat"].tobytes() == result.trace.vhat[i][there].tobytes()
             assert rows["flagged"].sum() == result.metrics["nodes"][str(i)].get("flagged", 0)
 
 

@@ -68,6 +68,9 @@ class Diary:
     def part_with(self, j: int) -> None:
         self.given.append(("part_with", j))
 
+    def distrust(self) -> None:
+        self.given.append(("distrust",))
+
     def resume(self, x: Array, y: Array, u: Array) -> None:
         self.given.append(("resume", x.tobytes(), y.tobytes(), u.tobytes()))
 
@@ -101,6 +104,7 @@ calls = st.one_of(
     st.tuples(st.just("exchange"), small, st.dictionaries(st.integers(1, 9), vectors, max_size=3)),
     st.tuples(st.just("late"), st.lists(st.builds(Late, st.integers(1, 9), small, small, vectors), min_size=1)),
     st.tuples(st.just("part_with"), st.integers(1, 9)),
+    st.tuples(st.just("distrust")),
     st.tuples(st.just("resume"), vectors, vectors, vectors),
 )
 
