@@ -44,9 +44,8 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=5.0, help="of every run")
     parser.add_argument("--repeat", type=int, default=3)
     args = parser.parse_args()
-    print(
-        "| topology | tick (ms) | late | missing | overruns | late ticks | worst tick (ms) |\n|---|---|---|---|---|---|---|"
-    )
+    print("| topology | tick (ms) | late | missing | overruns | late ticks | worst tick (ms) |")
+    print("|---|---|---|---|---|---|---|")
     for name, ticks in CASES.items():
         for tick in ticks:
             runs = [measure(name, tick, args.seconds) for _ in range(args.repeat)]

@@ -32,6 +32,7 @@ from duio_mesh.spec import NodeSpec
 At: TypeAlias = tuple[int, int]
 """(step, round)"""
 
+END = 0.1  # seconds after the last step in which messages that are on their way may still come
 GONE, BACK = b"gone", b"back"
 VAIN = 2  # steps in a row in which a neighbour is waited for until the deadline
 BEFORE = (-1, 0)
@@ -150,6 +151,10 @@ class Realtime:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+        """Close the last step. What is still on its way shortly after the end of a good run counts as late."""
+        end = time.monotonic() + (0.0 if error else END)
+        while self._missing() and (left := end - time.monotonic()) > 0:
+            self._take(left)
         self._close()
 
     @property
@@ -159,13 +164,15 @@ class Realtime:
 
     def timing(self) -> dict[str, int]:
         """Messages of the neighbours by when they came, and steps that took too long."""
-        missing = self._expected - self._on_time - self._tardy
         return {
             "on_time": self._on_time,
             "late": self._tardy,
-            "missing": missing,
+            "missing": self._missing(),
             "overruns": self._clock.overruns,
         }
+
+    def _missing(self) -> int:
+        return self._expected - self._on_time - self._tardy
 
     def noticed(self, who: str, alive: bool) -> None:
         """A directly linked process came or went (``Mesh.watch``). Who has gone is not waited for."""
