@@ -15,6 +15,7 @@ from rich.table import Table
 
 from duio_mesh import launcher
 from duio_mesh.launcher import RunResult
+from duio_mesh.report.recovery import loss_in_words
 from duio_mesh.report.timeliness import in_words
 from duio_mesh.synthesis.design import Design
 
@@ -98,12 +99,19 @@ def result(design: Design, result: RunResult, *, live: bool) -> None:
     _out.print(table)
     wanted = scenario.run.convergence
     words = f"[green]{good}[/]" if result.converged else f"[red]{bad}[/]"
+    if said := metrics.get("remarks"):
+        words += f"[yellow]{', but ' if result.converged else '; '}{'; '.join(said)}[/]"
     _out.print(
         f"{words}: {what} over the last {wanted.over_last:.0%} of the run "
         f"{'is' if result.converged else 'should be'} below {wanted.rms_below:g}"
     )
     if scenario.outside:
         _out.print("(the true state is not known: that the nodes agree does not prove that they are right)")
+    losses = metrics.get("recovery", [])
+    for loss in losses[:FEW]:
+        _out.print(loss_in_words(loss))
+    if len(losses) > FEW:
+        _out.print(f"and {len(losses) - FEW} further losses (recovery in metrics.json)")
     for warning in result.warnings:
         _out.print(f"[yellow]warning:[/] {warning}")
     _out.print(f"results    {result.folder}")

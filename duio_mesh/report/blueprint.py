@@ -116,7 +116,7 @@ def _overview(entities: Entities) -> rrb.Container:
     columns = rrb.TextLogColumns(text_log_columns=["LogLevel", "Body"])
     log = rrb.TextLogView(origin=EVENTS, name="Events", columns=columns)
     return rrb.Horizontal(
-        rrb.Vertical(errors, *lanes, row_shares=[3, 2, 2][: 1 + len(lanes)]),
+        rrb.Vertical(errors, *lanes, row_shares=[6, 5, 4] if entities.spec.flags else [3, 2]),
         rrb.Vertical(_topology(entities), log, row_shares=[3, 2]),
         column_shares=[5, 3],
         name="Overview",

@@ -31,9 +31,10 @@ def figures(folder: Path, scenario: Scenario, trace: Trace) -> list[Path]:
     nodes share one their lines have a broad shade there. Raises OSError when a file cannot be written.
     """
     drawing = _Drawing(folder, scenario, trace)
-    drawing.errors()
-    drawing.error_norms()
-    drawing.states()
+    if drawing.known:
+        drawing.errors()
+        drawing.error_norms()
+        drawing.states()
     drawing.estimates()
     if trace.what is not None:
         drawing.unknown_inputs(trace.what)
@@ -47,6 +48,7 @@ class _Drawing:
         self._folder, self._name, self._trace = folder, scenario.name, trace
         self._ids = trace.node_ids.tolist()
         self._colours = {i: _hex(c) for i, c in zip(self._ids, palette(len(self._ids)), strict=True)}
+        self.known = not len(trace.x) or not np.isnan(trace.x).all()  # whether somebody knew the true state
         self._hours = bool(len(trace.t)) and float(trace.t[-1]) >= 7200
         self._time = trace.t / 3600 if self._hours else trace.t
         self.written: list[Path] = []
@@ -95,13 +97,15 @@ class _Drawing:
         nodes = spread(self._ids, LINES)
 
         def draw(axes: Any, c: int) -> None:
-            self._line(axes, self._trace.x[:, c], color="0.65", lw=3, label="truth")
+            if self.known:
+                self._line(axes, self._trace.x[:, c], color="0.65", lw=3, label="truth")
             for i in nodes:
                 own = self._trace.xhat[self._ids.index(i), :, c]
                 self._own_line(axes, i, own)
             axes.set(title=f"$x_{{{c + 1}}}$")
 
-        self._grid("estimates.png", "States and their estimates", spread(range(self._trace.x.shape[1]), AXES), draw)
+        title = "States and their estimates" if self.known else "Estimates"
+        self._grid("estimates.png", title, spread(range(self._trace.x.shape[1]), AXES), draw)
 
     def unknown_inputs(self, what: Array) -> None:
         """One axes per unknown input, one line per node."""
@@ -148,6 +152,7 @@ class _Drawing:
             lowest.tick_params(labelbottom=True)
         shown = [axes.get_legend_handles_labels() for axes in grid.flat]
         named = dict(zip(shown[0][1], shown[0][0], strict=True))  # one entry of each name
+        named.pop("flagged", None)
         shaded = [dict(zip(names, handles, strict=True)) for handles, names in shown if "flagged" in names]
         named |= {"flagged": shaded[0]["flagged"]} if shaded else {}
         figure.legend(named.values(), named.keys(), loc="outside right upper", frameon=False)

@@ -56,9 +56,9 @@ def record_trace(path: Path, scenario: Scenario, trace: Trace, description: str 
 def _outline(recording: Recording, trace: Trace) -> None:
     """Who wrote rows from the first step on, who stopped before the last, and who came back."""
     written = {"plant": trace.x} | {f"node-{i}": trace.xhat[at] for at, i in enumerate(trace.node_ids.tolist())}
+    changes = [(0, who, "up") for who in written]
     for who, rows in written.items():
-        recording.liveness(who, "up", 0)
         for first, after in runs(np.flatnonzero(np.isnan(rows).all(axis=1))):
-            recording.liveness(who, "down", first)
-            if after < len(rows):
-                recording.liveness(who, "up", after)
+            changes += [(first, who, "down")] + ([(after, who, "up")] if after < len(rows) else [])
+    for k, who, state in sorted(changes, key=lambda change: change[0]):  # an edge is as its ends are at that time
+        recording.liveness(who, state, k)

@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 from duio_mesh.report.pairing import runs
 from duio_mesh.trace import Trace
 
+FEW = 8  # nodes that are named one by one
+
 
 def presence(trace: Trace) -> dict[int, dict[str, Any]]:
     """Of every node, by its id: ``flagged`` estimates, ``flagged_last`` (so many of its newest ones in a row), and
@@ -42,23 +44,22 @@ def present(trace: Trace) -> NDArray[np.bool_]:
 def remarks(trace: Trace) -> list[str]:
     """What has to be said beside the verdict, in words: who flags its newest estimates, who is gone at the end."""
     own, there = presence(trace), dict(zip(trace.node_ids.tolist(), present(trace).tolist(), strict=True))
-    flagging, gone = dict[int, list[int]](), dict[int, list[int]]()
-    for i, figures in own.items():
+    flagging = {i: figures["flagged_last"] for i, figures in own.items() if there[i] and figures["flagged_last"]}
+    gone = dict[int, list[int]]()
+    for i in own:
         if not there[i]:
-            gone.setdefault(figures["lost"][-1][0], []).append(i)
-        elif figures["flagged_last"]:
-            flagging.setdefault(figures["flagged_last"], []).append(i)
+            gone.setdefault(own[i]["lost"][-1][0], []).append(i)
     said = []
-    for count, ids in sorted(flagging.items()):
-        one = len(ids) == 1
-        estimates = "estimate" if count == 1 else f"{count} estimates"
-        said.append(f"{_named(ids)} {'flags its' if one else 'flag their'} last {estimates}")
+    if flagging:
+        least, most = min(flagging.values()), max(flagging.values())
+        count = f"{least} to {most} estimates" if least < most else "estimate" if most == 1 else f"{most} estimates"
+        said.append(f"{_named(list(flagging))} {'flags its' if len(flagging) == 1 else 'flag their'} last {count}")
     for k, ids in sorted(gone.items()):
         said.append(f"{_named(ids)} {'is' if len(ids) == 1 else 'are'} gone from step {k} on and not judged")
     return said
 
 
 def _named(ids: list[int]) -> str:
-    if len(ids) == 1:
-        return f"node {ids[0]}"
-    return f"nodes {', '.join(map(str, ids[:-1]))} and {ids[-1]}"
+    if len(ids) > FEW:
+        return f"{len(ids)} nodes"
+    return f"node {ids[0]}" if len(ids) == 1 else f"nodes {', '.join(map(str, ids[:-1]))} and {ids[-1]}"

@@ -19,7 +19,7 @@ K, LEVEL = 200, 0.01
 
 
 def make_trace(errors: NDArray[np.float64], *, flagged: Any = False, scale: float = 1.0) -> Trace:
-    """``errors`` (N, K): every component of the state is wrong by so much, with the signs alternating; NaN is no row."""
+    """``errors`` (N, K): every component of the state is wrong by so much, with alternating signs; NaN is no row."""
     x = scale * (3 + np.sin(np.arange(errors.shape[1] * 2, dtype=np.float64)).reshape(-1, 2))
     xhat = x + errors[:, :, None] * np.array([1.0, -1.0])
     flags = np.broadcast_to(np.asarray(flagged, dtype=bool), errors.shape).copy()
@@ -180,8 +180,13 @@ def test_marks_at_the_end_are_said_beside_the_verdict() -> None:
     flags[1, :199], flags[0, 199] = True, True
     flags[1, 199] = False
     assert metrics(make_trace(steady(), flagged=flags), scenario(), {})["remarks"] == [
-        "node 1 flags its last estimate",
-        "node 3 flags its last 40 estimates",
+        "nodes 1 and 3 flag their last 1 to 40 estimates"
+    ]
+    flags[2, 199] = False
+    assert metrics(make_trace(steady(), flagged=flags), scenario(), {})["remarks"] == ["node 1 flags its last estimate"]
+    many = np.ones((9, K), dtype=bool)
+    assert metrics(make_trace(steady(9), flagged=many), scenario(), {})["remarks"] == [
+        "9 nodes flag their last 200 estimates"
     ]
 
 
