@@ -148,3 +148,11 @@ def test_in_one_process_there_is_no_clock() -> None:
         assert oracle.end() in (0, 1)
     assert "realtime in one process is the ideal network" in " ".join(oracle.stderr.split())
     assert json.loads((oracle.out / "metrics.json").read_text())["steps"] == 20
+
+
+def test_a_node_that_is_killed_ends_the_run_and_nothing_hangs() -> None:
+    with Stopped("ring.yaml", "--set", "timing={mode: realtime, tick: 0.05}", "--no-record") as killed:
+        wait_for(lambda: rows(killed.out, "node-3") >= 3 * killed.row)
+        killed.send("node-3", signal.SIGKILL)
+        assert killed.end() == 3
+    assert "node-3 was killed by SIGKILL" in killed.stderr
