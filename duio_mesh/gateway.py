@@ -93,7 +93,7 @@ class Inlet:
         """
         begin, beat = time.monotonic(), 0.0
         limit = self._spec.deadline if self.steps.k else self._outside.start_within
-        while (step := self.steps.next(now := time.monotonic())) is None:
+        while (step := self.steps.next(now := time.monotonic(), over=self._over)) is None:
             if self._over:
                 self._end()
                 return None

@@ -122,6 +122,7 @@ class Launch:
                 unknown_inputs=reconstructs(design)[0],
                 flags=any(spec.without for spec in design.nodes.values()),
                 watch_step=getattr(design.scenario.options, "watch_step", None),
+                outside=design.plant.outside is not None,
                 tick=design.plant.tick,
                 wire=wires["recorder"],
             )

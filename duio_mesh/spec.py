@@ -80,18 +80,18 @@ class NodeSpec:
     credit: int  # report progress to the plant every this many steps
     block: int  # steps whose samples the plant sends in one frame
     batch: int  # steps between two exchanges: 1, or as many as the observer fuses at once
-    kept: bool = False  # no estimate may be lost on its way to the recorder, which writes them down
     tick: float = 0.0  # wall seconds per step; 0 is lockstep
     wait: float = 0.0  # seconds from a sample's arrival in which all rounds of its step may wait
     faults: Incoming = UNDISTURBED  # on purpose, of its own in-edges
     spoils: Mapping[int, tuple[Rule, ...]] = dataclasses.field(default_factory=dict)  # of frames to out-neighbours
     without: str = ""  # what to do without a neighbour's message; "" where none can be missing
     outside: bool = False  # samples come from outside: they may take their time, and end before the last step
+    kept: bool = False  # no estimate may be lost on its way to the recorder, which writes them down
     output: str = ""  # file of this node's own estimates, float64 rows; "" keeps none
+    inputs: str = ""  # file of everything that the observer is given (duio_mesh.tape); "" keeps none
     wire: Wire = UNWIRED
 
 
-    inputs: str = ""  # file of everything that the observer is given (duio_mesh.tape); "" keeps none
 @dataclasses.dataclass(frozen=True)
 class SensorSpec:
     """What the plant needs to measure for one node: y_i = C_i x + F_i v_i, u_i = u[known]."""
@@ -166,8 +166,9 @@ class RecorderSpec:
     unknown_inputs: int = 0  # of a row's columns after the n states, so many estimate w; the rest the node's own noise
     flags: bool = False  # the last column of a row says whether the node marks its estimate
     watch_step: int | None = None  # a step whose rounds the nodes tell one by one
-    kept: bool = False  # write all rows down as they come: their own journals are on other hosts
+    outside: bool = False  # nobody knows the true state: the errors are distances from the mean estimate
     tick: float = 0.0  # wall seconds per step, and nodes tell which neighbours were missing; 0 is lockstep
+    kept: bool = False  # write all rows down as they come: their own journals are on other hosts
     wire: Wire = UNWIRED
 
 
@@ -218,6 +219,12 @@ def _load(data: bytes) -> Any:
     return msgpack.unpackb(data, ext_hook=_unpack, use_list=False, strict_map_key=False)
 
 
+def packed(value: Any) -> bytes:
+    """Any part of a spec as msgpack. Raises TypeError for what a spec cannot hold."""
+    data: bytes = msgpack.packb(value, default=_pack)
+    return data
+
+
 def write_spec(spec: AnySpec, path: Path) -> None:
     """Write ``spec`` readable by its owner only (mode 0600)."""
     data = packed(spec)
@@ -237,9 +244,3 @@ def read_spec(path: Path, kind: type[Spec]) -> Spec:
     if not isinstance(spec, kind):
         raise ValueError(f"{path} holds a {type(spec).__name__}, not a {kind.__name__}")
     return spec
-def packed(value: Any) -> bytes:
-    """Any part of a spec as msgpack. Raises TypeError for what a spec cannot hold."""
-    data: bytes = msgpack.packb(value, default=_pack)
-    return data
-
-

@@ -18,6 +18,7 @@ file, endpoint = given.get(1, Path(__file__).with_name("rooms.csv")), given.get(
 config = zenoh.Config()
 config.insert_json5("mode", '"client"')
 config.insert_json5("connect/endpoints", json.dumps([endpoint]))
+config.insert_json5("connect/timeout_ms", "-1")  # wait for the gateway
 with zenoh.open(config) as session, open(file, newline="") as rows:
     table = csv.DictReader(rows)
     nodes = sorted({name.split(".")[0] for name in table.fieldnames})

@@ -5,8 +5,8 @@ set of steps, both as the RMS per component:
 
 - disagreement: x-hat_i(k) minus the mean of all nodes' estimates of x(k), in the unit of the states,
 - residual: y_i(k) - C_i x-hat_j(k) over all other nodes j, in the unit of the measurements: what node i measures, and
-  what the others, who do not see it, expect it to measure. It holds the sensor's own noise. (With x-hat_i itself it would
-  be zero by construction for most methods: they fit their own measurements exactly. A node alone has only that.)
+  what the others, who do not see it, expect it to measure. It holds the sensor's own noise. (With x-hat_i itself it
+  would be zero by construction for most methods: they fit their own measurements. A node alone has only that.)
 
 Small figures do not prove that the estimates are right: all nodes may be wrong together where nobody measures. Large
 ones prove that something is wrong: the model, a sensor, or an input that is driven and that nobody counts with.

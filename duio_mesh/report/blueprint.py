@@ -12,6 +12,7 @@ import rerun.blueprint as rrb
 from duio_mesh.report.entities import DESCRIPTION, EVENTS, FLAGS, GAPS, RATES, STATES, TRUTH, WATCHED, Entities, spread
 from duio_mesh.report.topology import positions
 
+DISTANCE = "Distance from the mean estimate: log10 ‖x̂ − mean‖"  # where nobody knows the true state
 VIEWS = 12  # states that are shown side by side
 LINES = 16  # nodes whose lines share a view, and nodes with a tab of their own
 LEGEND = 12  # lines that a legend names
@@ -106,7 +107,7 @@ def _map(entities: Entities) -> Iterator[tuple[str, Any]]:
 
 def _overview(entities: Entities) -> rrb.Container:
     errors = _plot(
-        "Estimation error: log10 ‖x̂ − x‖",
+        DISTANCE if entities.spec.outside else "Estimation error: log10 ‖x̂ − x‖",
         [entities.error(i) for i in entities.ids],
         legend=len(entities.ids) <= LEGEND,
     )

@@ -41,6 +41,7 @@ def record_trace(path: Path, scenario: Scenario, trace: Trace, description: str 
         unknown_inputs=q,
         flags=trace.flagged is not None,
         watch_step=getattr(scenario.options, "watch_step", None),
+        outside=scenario.outside is not None,
     )
     try:
         with Recording(spec, rates=False) as recording:

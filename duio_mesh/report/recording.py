@@ -18,7 +18,7 @@ from duio_mesh.report.conditions import Conditions
 from duio_mesh.report.entities import EVENTS, WATCHED, Column, Entities
 from duio_mesh.report.flags import Flags
 from duio_mesh.report.gaps import Gaps
-from duio_mesh.report.pairing import Decimator, Errors, Pairing, Span, Spans, log_norms, runs
+from duio_mesh.report.pairing import Decimator, Errors, Middle, Pairing, Span, Spans, log_norms, runs
 from duio_mesh.report.streams import Batch, FileStream, LiveStream, Opening
 from duio_mesh.spec import RecorderSpec
 
@@ -48,7 +48,8 @@ class Recording:
         self._live = LiveStream(opening) if spec.live else None
         self._closed, self._watched = False, set[int]()
 
-        self._pairing = Pairing(spec.n, entities.ids, spec.steps)
+        self._middle = Middle(spec.n, entities.ids, spec.steps) if spec.outside else None
+        self._pairing = self._middle or Pairing(spec.n, entities.ids, spec.steps)
         self._seen: dict[int | None, Spans] = {source: Spans() for source in (None, *entities.ids)}
         self._thinned = {i: Decimator(entities.error_stride) for i in entities.ids}
         self._columns: dict[int | None, tuple[Column, ...]] = {None: entities.truth}
@@ -91,7 +92,11 @@ class Recording:
         self._check(f"node {node}", k, rows, self._spec.sizes[node])
         self._record(node, k, rows)
         for first, last in self._pairing.known[node].gaps(k, k + len(rows)):
-            self._say(self._pairing.estimates(node, first, rows[first - k : last - k, : self._spec.n]))
+            part = rows[first - k : last - k, : self._spec.n]
+            for errors in self._middle.together(node, first, part) if self._middle else ():
+                self._say(errors)
+            if not self._middle:
+                self._say(self._pairing.estimates(node, first, part))
 
     def rounds(self, node: int, rows: Array) -> None:
         """Rows (m, 3) [round, residual, disagreement] of the step ``spec.watch_step``; a node's first ones count.
@@ -145,10 +150,15 @@ class Recording:
             buffer.flush()
         self._file.flush()
 
-    def missing(self) -> dict[int | None, list[Span]]:
-        """Steps (first, last + 1) whose rows or errors are not in the recording, by node; None is the truth."""
-        steps = self._spec.steps
+    def missing(self, steps: int | None = None) -> dict[int | None, list[Span]]:
+        """Steps (first, last + 1) whose rows or errors are not in the recording, by node; None is the truth.
+
+        Of the first ``steps`` steps, by default of all. A truth that nobody knows is not missing.
+        """
+        steps = self._spec.steps if steps is None else steps
         found = {None: self._seen[None].gaps(0, steps)} | {i: s.gaps(0, steps) for i, s in self._pairing.known.items()}
+        if self._spec.outside:
+            del found[None]
         return {source: gaps for source, gaps in found.items() if gaps}
 
     def fill(self, truth: Array, estimates: Mapping[int, Array]) -> None:
@@ -175,9 +185,12 @@ class Recording:
         self._conditions.settle(final=True)
         for i, decimator in self._thinned.items():
             self._errors[i].add(*_column(*decimator.drain()))
-        missing = self.missing()
+        steps = self._spec.steps
+        if self._spec.outside:  # who feeds the run may end it early
+            steps = max(self._reached(f"node-{i}") for i in self._entities.ids)
+        missing = self.missing(steps)
         if not missing:
-            self.event("complete: every step of every node is here", "INFO", self._spec.steps - 1)
+            self.event("complete: every step of every node is here", "INFO", max(0, steps - 1))
         for source, gaps in missing.items():
             who = "the truth" if source is None else f"node {source}"
             spans = ", ".join(f"{a} to {b - 1}" for a, b in gaps[:8]) + (", ..." if len(gaps) > 8 else "")

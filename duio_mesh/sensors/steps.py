@@ -64,10 +64,13 @@ class Steps:
                 feed.waiting = {number: sample.values}
             self._start()
 
-    def next(self, now: float) -> dict[str, Array] | None:
-        """The values of step k by key, None while there is nothing complete. ``now``: seconds of any steady clock."""
+    def next(self, now: float, *, over: bool = False) -> dict[str, Array] | None:
+        """The values of step k by key, None while there is nothing complete.
+
+        ``now``: seconds of any steady clock; ``over``: nothing more will come, so who is late stays late.
+        """
         missing = self.missing()
-        if missing and not self._overdue(missing, now):
+        if missing and not self._overdue(missing, now, over):
             return None
         step = {}
         for key, feed in self._feeds.items():
@@ -95,12 +98,12 @@ class Steps:
         wanted = f"its sample {feed.base + self.k} is missing; " if self.started and feed.counts else ""
         return wanted + (f"the last was number {feed.newest}" if feed.counts else f"{feed.arrived} samples came")
 
-    def _overdue(self, missing: list[str], now: float) -> bool:
+    def _overdue(self, missing: list[str], now: float, over: bool) -> bool:
         if not self.started or self.k == 0 or len(missing) == len(self._feeds):
             return False
         if self._since is None:
             self._since = now
-        return now - self._since >= self._hold
+        return now - self._since >= self._hold or (over and self._hold < inf)
 
     def _start(self) -> None:
         """Begin when everybody has spoken."""
