@@ -32,6 +32,7 @@ bench: $(VENV)/ready ## speed, as ratios inside one interleaved run; the tables 
 	$(PY) bench/exchange.py --repeat 3 --rounds 4000
 	$(PY) bench/admm.py
 	$(PY) bench/startup.py
+	$(PY) bench/tape.py
 
 reliability: $(VENV)/tests ## what every observer makes of every fault; the table of docs/reliability.md
 	OPENBLAS_NUM_THREADS=1 $(PY) bench/reliability.py --write

@@ -1,6 +1,6 @@
 """Lockstep rounds per second on a ring: the project's mesh against the same exchange over bare transports.
 
-    python bench/exchange.py [--nodes 4 8 16 32] [--rounds 8000] [--size 6] [--repeat 5] [--memory 4 16 64]
+    python bench/exchange.py [--nodes 4 8 16 32 64] [--rounds 8000] [--size 6] [--repeat 5] [--memory 4 16 64]
 
 The rivals (rivals.py) share no code with the project. Its own rows: `admm` on a generated ring of N nodes, 199 rounds a
 step, so that plant and journals do not count; and, for N = 4, the nine-room ring with one round a step, plant, journals
@@ -11,16 +11,16 @@ the ratios are within one run.
 from __future__ import annotations
 
 import argparse
-import os
 import statistics
 from functools import partial
-from pathlib import Path
+from typing import TYPE_CHECKING
 
-import rings
 import rivals
 from interleave import Contenders, interleaved, machine, table
+from processes import memories
 
-from duio_mesh.launcher import Progress
+if TYPE_CHECKING:
+    from duio_mesh.launcher import Progress
 
 REFERENCE = "bare Zenoh"
 ROUNDS = 199  # exchanges per step of the project's ring
@@ -29,6 +29,8 @@ MPI_SHARE = 10  # MPI spins while it waits: with more processes than cores it ge
 
 def contenders(count: int, rounds: int, size: int) -> Contenders:
     """Everybody's measurement for a ring of ``count`` processes."""
+    import rings  # not at the top: every process of a rival imports this module
+
     ring = rings.admm_ring(count, max(1, rounds // ROUNDS), {"nu": ROUNDS + 1})
     found = {
         REFERENCE: partial(rivals.bare_zenoh, count, rounds, size),
@@ -45,26 +47,16 @@ def contenders(count: int, rounds: int, size: int) -> Contenders:
     }
 
 
-def descendants(pid: int) -> list[int]:
-    """All processes below this one."""
-    found: list[int] = []
-    for path in Path(f"/proc/{pid}/task").glob("*/children"):
-        for child in map(int, path.read_text().split()):
-            found += [child, *descendants(child)]
-    return found
-
-
 def node_memory(count: int) -> float:
     """PSS of a node process in MB while the ring runs, the median over its nodes."""
+    import rings
+
     sizes: list[float] = []
 
     def look(progress: Progress) -> None:
         if sizes or not progress.steps:
             return
-        for pid in descendants(os.getpid()):
-            if (process := Path(f"/proc/{pid}")).joinpath("cmdline").read_bytes().startswith(b"duio-node-"):
-                lines = process.joinpath("smaps_rollup").read_text().splitlines()
-                sizes.extend(int(line.split()[1]) / 1024 for line in lines if line.startswith("Pss:"))
+        sizes.extend(size.pss for who, size in memories().items() if who.startswith("node-"))
 
     rings.run_mesh(rings.admm_ring(count, 4000 // count, {"nu": 60}), show=look)
     if len(sizes) != count:
@@ -75,7 +67,7 @@ def node_memory(count: int) -> float:
 def main() -> None:
     """Interleave and print the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--nodes", type=int, nargs="*", default=[4, 8, 16, 32])
+    parser.add_argument("--nodes", type=int, nargs="*", default=[4, 8, 16, 32, 64])
     parser.add_argument("--rounds", type=int, default=8000, help="of a ring of four; N nodes do 4/N of them")
     parser.add_argument("--size", type=int, default=6, help="doubles a message of the bare exchanges")
     parser.add_argument("--repeat", type=int, default=5)

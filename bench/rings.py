@@ -44,6 +44,11 @@ def admm_ring(count: int, steps: int, observer: Mapping[str, Any], **run: Any) -
         return duio_mesh.synthesise(duio_mesh.load_scenario(path))
 
 
+def rounds_per_step(count: int) -> int:
+    """Exchanges of a step of `finite_time` on a ring of ``count``: one per different nonzero eigenvalue."""
+    return count // 2
+
+
 def lmi_ring(steps: int) -> Design:
     """topologies/ring.yaml for so many steps: four nodes, n = 9, one round a step."""
     return duio_mesh.synthesise(duio_mesh.load_scenario(TOPOLOGIES / "ring.yaml", **{"run.steps": steps}))

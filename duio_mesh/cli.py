@@ -33,6 +33,7 @@ examples:
   python launch.py topologies/ring.yaml --steps 2000 --seed 7 --plot
   python launch.py topologies/ring.yaml --set plant.noise.variance=0 --set graph.edges='[[1,2],[3,4]]'
   python launch.py topologies/six_state_ring.yaml --check
+  python launch.py replay runs/heat-ring/latest --node 3   (one node again, alone, from its inputs; replay --help)
   python launch.py new heat --rooms 8x8 --nodes 16 --out topologies/heat8x8.yaml   (new --help: write a topology file)
 """
 
@@ -52,7 +53,7 @@ def parser() -> argparse.ArgumentParser:
     how = p.add_mutually_exclusive_group()
     how.add_argument("--in-process", action="store_true", help="the oracle: one process, no Zenoh, the same bits")
     how.add_argument("--check", action="store_true", help="validate, check the theory, design, start nothing")
-    how.add_argument("--dry-run", action="store_true", help="print what would be started")
+    how.add_argument("--dry-run", action="store_true", help="print what would be started; with --out keep the design")
     p.add_argument(
         "--contingency",
         type=int,
@@ -62,6 +63,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--live", action="store_true", help="also serve the recording to a Rerun viewer on this host")
     p.add_argument("--plot", action="store_true", help="write PNG figures of the errors and states into the results")
     p.add_argument("--no-record", action="store_true", help="no recorder process, no recording.rrd")
+    p.add_argument("--inputs", action="store_true", help="keep each node's inputs, for `replay` (docs/replay.md)")
     p.add_argument(
         "--set",
         action="append",
@@ -77,10 +79,18 @@ def parser() -> argparse.ArgumentParser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; the exit code."""
     argv = sys.argv[1:] if argv is None else argv
+    if argv and argv[0] in ("export", "gather"):
+        from duio_mesh.deploy import command as deploy
+
+        return deploy.main(argv)
     if list(argv[:1]) == ["new"]:
         from duio_mesh.generate import command
 
         return command.main(argv[1:])
+    if list(argv[:1]) == ["replay"]:
+        from duio_mesh import replay
+
+        return replay.main(argv[1:])
     args = parser().parse_args(argv)
     if args.contingency is not None and not args.check:
         parser().error("--contingency says what a design is worth on other graphs: use it with --check")
@@ -107,9 +117,13 @@ def _main(args: argparse.Namespace) -> int:
     from duio_mesh import synthesis
     from duio_mesh.scenario import load_scenario
 
-    flags = {"run.steps": args.steps, "run.seed": args.seed}
+    flags = {"run.steps": args.steps, "run.seed": args.seed, "run.inputs": "true" if args.inputs else None}
     overrides = args.overrides + [f"{path}={value}" for path, value in flags.items() if value is not None]
     scenario = load_scenario(args.topology, overrides, options_of=synthesis.options_of)
+    if scenario.outside and args.in_process:
+        raise ScenarioError(
+            ["--in-process: the measurements of this file come from outside (external:), which only processes can hear"]
+        )
     if args.out and args.out.exists() and (not args.out.is_dir() or any(args.out.iterdir())):
         raise ScenarioError([f"--out {args.out}: already exists and is not empty; a run is never overwritten"])
 
@@ -127,6 +141,10 @@ def _main(args: argparse.Namespace) -> int:
             return CONVERGED
         if args.dry_run:
             console.plan(design, record=not args.no_record)
+            if args.out:
+                from duio_mesh.deploy.stored import write_design
+
+                print(f"design     {write_design(design, args.out)}")
             return CONVERGED
         result = _run(design, args, supervisor)
     console.result(design, result, live=args.live)
@@ -148,6 +166,7 @@ def _run(design: Design, args: argparse.Namespace, supervisor: Supervisor | None
     """Run the design as asked, with progress, and draw the figures."""
     from duio_mesh import console, launcher
 
+    console.clock(design, processes=supervisor is not None)
     with console.progress(design) as show:
         if supervisor is None:
             result = launcher.run_in_process(design, args.out, record=not args.no_record, show=show)

@@ -15,6 +15,8 @@ from rich.table import Table
 
 from duio_mesh import launcher
 from duio_mesh.launcher import RunResult
+from duio_mesh.report.recovery import loss_in_words
+from duio_mesh.report.timeliness import in_words
 from duio_mesh.synthesis.design import Design
 
 SLOW = 0.1  # of an error left by a step that starts afresh: the estimate is not worth its name
@@ -46,10 +48,16 @@ def progress(design: Design) -> Iterator[launcher.Show]:
         def show(now: launcher.Progress) -> None:
             speed = bar.tasks[0].speed
             rate = f"{speed:,.0f} steps/s" if speed else ""
-            errors = f"[yellow]{escape(now.waiting)}[/]" if now.waiting else errors_in_words(now.errors)
+            errors = f"[yellow]{escape(now.note)}[/]" if now.note else errors_in_words(now.errors)
             bar.update(task, completed=now.steps, rate=rate, errors=errors)
 
         yield show
+
+
+def clock(design: Design, *, processes: bool) -> None:
+    """What a run on the wall clock is about to do, above all how long it will take."""
+    if words := in_words(design.scenario.timing, design.plant.steps, processes=processes):
+        _err.print(words, soft_wrap=True)
 
 
 def errors_in_words(errors: Mapping[int, float]) -> str:
@@ -79,17 +87,32 @@ def result(design: Design, result: RunResult, *, live: bool) -> None:
     """The table of errors, the verdict, and where everything is."""
     scenario, metrics = design.scenario, result.metrics
     table = Table(title=f"{scenario.name}: {scenario.method}, {len(scenario.nodes)} nodes, {metrics['steps']} steps")
-    for column in ("node", "RMS error", "final error"):
+    figures = {"RMS error": "rms", "final error": "final"}
+    good, bad, what = "converged", "did not converge", "every node's RMS error"
+    if scenario.outside:  # no truth, no error
+        figures = {"disagreement": "disagreement", "residual": "residual"}
+        good, bad = "the nodes agree", "the nodes do not agree"
+        what = "every node's distance from the mean estimate, and what it measures from what the others expect,"
+    for column in ("node", *figures):
         table.add_column(column, justify="right")
     for i, node in metrics["nodes"].items():
-        table.add_row(str(i), _number(node["rms"]), _number(node["final"]))
+        table.add_row(str(i), *(_number(node[name]) for name in figures.values()))
     _out.print(table)
     wanted = scenario.run.convergence
-    words = "[green]converged[/]" if result.converged else "[red]did not converge[/]"
+    words = f"[green]{good}[/]" if result.converged else f"[red]{bad}[/]"
+    if said := metrics.get("remarks"):
+        words += f"[yellow]{', but ' if result.converged else '; '}{'; '.join(said)}[/]"
     _out.print(
-        f"{words}: every node's RMS error over the last {wanted.over_last:.0%} of the run "
+        f"{words}: {what} over the last {wanted.over_last:.0%} of the run "
         f"{'is' if result.converged else 'should be'} below {wanted.rms_below:g}"
     )
+    if scenario.outside:
+        _out.print("(the true state is not known: that the nodes agree does not prove that they are right)")
+    losses = metrics.get("recovery", [])
+    for loss in losses[:FEW]:
+        _out.print(loss_in_words(loss))
+    if len(losses) > FEW:
+        _out.print(f"and {len(losses) - FEW} further losses (recovery in metrics.json)")
     for warning in result.warnings:
         _out.print(f"[yellow]warning:[/] {warning}")
     _out.print(f"results    {result.folder}")
@@ -148,7 +171,11 @@ def _by_node(nodes: Mapping[Any, Mapping[str, Any]]) -> Table:
 
 def plan(design: Design, *, record: bool) -> None:
     """What a run would start, and who would talk to whom."""
-    _say("duio-plant", "plant", "plant", f"measures for {_text(list(design.nodes))}")
+    if outside := design.plant.outside:
+        where = f"listens on {outside.listen}" if outside.listen else f"connects to {outside.connect}"
+        _say("duio-gateway", "gateway", "gateway", f"{where} for {', '.join(outside.sizes)}")
+    else:
+        _say("duio-plant", "plant", "plant", f"measures for {_text(list(design.nodes))}")
     for i, spec in design.nodes.items():
         talks = f"hears {_text(list(spec.hears))}, tells {_text(list(spec.tells))}"
         _say(f"duio-node-{i}", "node", f"node-{i}", talks)

@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 from duio_mesh.spec import AUTHORITY, CERTIFICATE, KEY, PASSWORD, USERS
 
@@ -27,11 +27,15 @@ SKEW = timedelta(hours=1)  # by which the clocks of hosts may differ
 BYTES = 32  # of a password, drawn at random
 
 
-def issue(root: Path, mode: str, run: str, dials: Mapping[str, tuple[str, ...]], host: str) -> dict[str, Path]:
+Hosts: TypeAlias = str | Mapping[str, tuple[str, ...]]  # the address of all, or the addresses and names of each
+
+
+def issue(root: Path, mode: str, run: str, dials: Mapping[str, tuple[str, ...]], host: Hosts) -> dict[str, Path]:
     """Write what every process needs to prove who it is; the folder of each.
 
-    ``root`` is made; ``dials`` says for every process to which others it connects; ``host`` is the address that they
-    listen on. Raises OSError when a file cannot be written, ValueError when the mode is neither password nor mtls.
+    ``root`` is made; ``dials`` says for every process to which others it connects; ``host`` is what they are dialled
+    by: one address or name for all, or those of each. Raises OSError when a file cannot be written, ValueError when the
+    mode is neither password nor mtls.
     """
     if mode not in ("password", "mtls"):
         raise ValueError(f"no such security mode: {mode}")
@@ -40,7 +44,7 @@ def issue(root: Path, mode: str, run: str, dials: Mapping[str, tuple[str, ...]],
     for folder in folders.values():
         folder.mkdir(mode=0o700)
     if mode == "mtls":
-        _certificates(folders, run, host)
+        _certificates(folders, run, dict.fromkeys(folders, (host,)) if isinstance(host, str) else host)
     else:
         _passwords(folders, dials)
     return folders
@@ -73,8 +77,8 @@ class _Signer:
     key: EllipticCurvePrivateKey
     name: Name
 
-    def certify(self, subject: Name, key: EllipticCurvePrivateKey, host: str | None) -> Certificate:
-        """A certificate for ``subject``; without a host that of an authority."""
+    def certify(self, subject: Name, key: EllipticCurvePrivateKey, hosts: tuple[str, ...]) -> Certificate:
+        """A certificate for ``subject``; without hosts that of an authority."""
         from cryptography import x509
         from cryptography.hazmat.primitives import hashes
         from cryptography.x509.oid import ExtendedKeyUsageOID
@@ -88,12 +92,12 @@ class _Signer:
             .serial_number(x509.random_serial_number())
             .not_valid_before(now - SKEW)
             .not_valid_after(now + LIFETIME)
-            .add_extension(x509.BasicConstraints(ca=host is None, path_length=0 if host is None else None), True)
+            .add_extension(x509.BasicConstraints(ca=not hosts, path_length=None if hosts else 0), True)
         )
-        if host is not None:
+        if hosts:
             both = [ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH]
             builder = builder.add_extension(x509.ExtendedKeyUsage(both), False)
-            builder = builder.add_extension(x509.SubjectAlternativeName([_general_name(host)]), False)
+            builder = builder.add_extension(x509.SubjectAlternativeName([*map(_general_name, hosts)]), False)
         return builder.sign(self.key, hashes.SHA256())
 
 
@@ -106,7 +110,7 @@ def _general_name(host: str) -> GeneralName:
         return x509.DNSName(host)
 
 
-def _certificates(folders: Mapping[str, Path], run: str, host: str) -> None:
+def _certificates(folders: Mapping[str, Path], run: str, hosts: Mapping[str, tuple[str, ...]]) -> None:
     """An authority, and for each process a key and a certificate that names the process and the run."""
     from cryptography import x509
     from cryptography.hazmat.primitives import serialization
@@ -125,11 +129,11 @@ def _certificates(folders: Mapping[str, Path], run: str, host: str) -> None:
         return certificate.public_bytes(serialization.Encoding.PEM)
 
     signer = _Signer(ec.generate_private_key(ec.SECP256R1()), name("authority"))
-    authority = pem(signer.certify(signer.name, signer.key, None))
+    authority = pem(signer.certify(signer.name, signer.key, ()))
     for who, folder in folders.items():
         key = ec.generate_private_key(ec.SECP256R1())
         _write(folder / AUTHORITY, authority)
-        _write(folder / CERTIFICATE, pem(signer.certify(name(who), key, host)))
+        _write(folder / CERTIFICATE, pem(signer.certify(name(who), key, hosts[who])))
         plain = serialization.NoEncryption()
         form = serialization.PrivateFormat.PKCS8
         _write(folder / KEY, key.private_bytes(serialization.Encoding.PEM, form, plain))

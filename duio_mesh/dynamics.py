@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from duio_mesh.arrays import Array
+from duio_mesh.errors import ScenarioError
 from duio_mesh.spec import PlantSpec, SensorSpec
 
 # one independent random stream per purpose and node: adding a node changes nobody else's noise
@@ -49,6 +50,9 @@ class Plant:
     """
 
     def __init__(self, spec: PlantSpec) -> None:
+        """Raises ScenarioError when the measurements come from outside."""
+        if spec.outside:
+            raise ScenarioError(["plant: external: the measurements come from outside; there is nothing to simulate"])
         self.spec = spec
         self.k = 0
         self._sensors = _Sensors(spec)

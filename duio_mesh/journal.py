@@ -18,6 +18,7 @@ if TYPE_CHECKING:  # the launcher reads journals and must not load Zenoh
 PERIOD = 0.1  # seconds between batches: soon enough for the eye, and cheap
 BATCH_BYTES = 1 << 16
 ASIDE = 1  # the round of a frame that holds other rows than the journal's
+MISSING = 2  # ... and of one that says, step by step, how many neighbours were missing
 
 
 class Journal:
@@ -27,10 +28,14 @@ class Journal:
     recorder that is slow, frozen or dead costs nothing.
     """
 
-    def __init__(self, path: str, size: int, outlet: Outlet, first: int = 0) -> None:
-        """``first``: the step of the first row; earlier ones that the file does not hold become NaN."""
+    def __init__(self, path: str, size: int, outlet: Outlet, first: int = 0, kind: int = 0) -> None:
+        """``first``: the step of the first row; earlier ones that the file does not hold become NaN.
+
+        ``kind``: the round of the frames that carry these rows.
+        """
         if path and first:
             _fill(Path(path), size, first)
+        self._kind = kind
         self._file = Path(path).open("ab") if path else None  # noqa: SIM115  (closed in __exit__)
         self._outlet = outlet
         self._rows = np.empty((max(1, BATCH_BYTES // (8 * max(1, size))), size))
@@ -71,7 +76,7 @@ class Journal:
         if self._file:
             self._file.write(rows.astype("<f8", copy=False).tobytes())
             self._file.flush()
-        self._outlet.send(self._first, 0, rows)
+        self._outlet.send(self._first, self._kind, rows)
         self._first += self._filled
         self._filled = 0
 
@@ -87,6 +92,11 @@ def _fill(path: Path, size: int, rows: int) -> None:
 def aside(path: str | Path) -> Path:
     """Where the journal ``path`` has its rows of another kind."""
     return Path(f"{path}.aside")
+
+
+def missing(path: str | Path) -> Path:
+    """Where a node with the journal ``path`` says how many neighbours were missing: rows of one number."""
+    return Path(f"{path}.missing")
 
 
 def map_rows(path: str | Path, size: int) -> Array:

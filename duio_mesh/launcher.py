@@ -23,6 +23,7 @@ from duio_mesh.faults import COUNTED
 from duio_mesh.recovery import Recovery
 from duio_mesh.report.description import describe
 from duio_mesh.report.metrics import metrics
+from duio_mesh.report.timeliness import timeliness, untimely
 from duio_mesh.report.trace_file import write_trace
 from duio_mesh.run_folder import RunFolder
 from duio_mesh.scenario.model import Scenario
@@ -30,7 +31,7 @@ from duio_mesh.simulation import Trace, estimate_sizes, reconstructs, simulate
 from duio_mesh.spec import NodeSpec, PlantSpec, RecorderSpec, write_spec
 from duio_mesh.supervisor import Supervisor
 from duio_mesh.synthesis.design import Design
-from duio_mesh.wiring import LOOPBACK, Wiring, check_address
+from duio_mesh.wiring import LOOPBACK, Wired, Wiring, check_address
 
 CLOSING = 10.0  # seconds for the recorder to fill gaps and close its file ...
 CLOSING_ROWS = 50_000  # ... and a second more for every so many rows
@@ -42,7 +43,7 @@ class Progress:
 
     steps: int  # finished by every node
     errors: Mapping[int, float]  # node id -> RMS over the states of its newest error; empty before
-    waiting: str = ""  # who waits for whom, once that takes long
+    note: str = ""  # for what everybody is waiting
 
 
 Show: TypeAlias = Callable[[Progress], None]
@@ -71,7 +72,7 @@ class RunResult:
     folder: Path
     trace: Trace
     metrics: Mapping[str, Any]
-    converged: bool
+    converged: bool  # as the file asks; where nobody knows the truth: whether the nodes agree
     warnings: tuple[str, ...]  # what went wrong without stopping the run
 
 
@@ -87,23 +88,25 @@ class Launch:
         record: bool,
         live: bool,
         address: str = LOOPBACK,
+        wiring: Wired | None = None,
     ) -> None:
         self._design, self._folder, self._supervisor = design, folder, supervisor
         self._record, self._live = record, live
         self._sizes = estimate_sizes(design)
         self._url = ""  # of the live server, once the recorder has said it
-        self._wiring = Wiring(design, folder.keys, record=record, address=address)
+        self._wiring = wiring or Wiring(design, folder.keys, record=record, address=address)
 
     def specs(self) -> dict[str, NodeSpec | PlantSpec | RecorderSpec]:
         """Every process' spec, with endpoints that are reserved for it."""
         design, folder, wires = self._design, self._folder, self._wiring.wires()
-        ids = sorted(design.nodes)
+        ids, who = sorted(design.nodes), "gateway" if design.plant.outside else "plant"
         specs: dict[str, NodeSpec | PlantSpec | RecorderSpec] = {
-            "plant": replace(design.plant, wire=wires["plant"], output=str(folder.rows("plant")), recorded=self._record)
+            who: replace(design.plant, wire=wires["plant"], output=str(folder.rows(who)), recorded=self._record)
         }
         for i, spec in design.nodes.items():
             who = f"node-{i}"
-            specs[who] = replace(spec, wire=wires[who], output=str(folder.rows(who)))
+            inputs = str(folder.inputs(who)) if design.scenario.run.inputs else ""
+            specs[who] = replace(spec, wire=wires[who], output=str(folder.rows(who)), inputs=inputs)
         if self._record:
             specs["recorder"] = RecorderSpec(
                 name=design.scenario.name,
@@ -118,7 +121,10 @@ class Launch:
                 truth=str(folder.rows("plant")),
                 estimates={i: str(folder.rows(f"node-{i}")) for i in ids},
                 unknown_inputs=reconstructs(design)[0],
+                flags=any(spec.without for spec in design.nodes.values()),
                 watch_step=getattr(design.scenario.options, "watch_step", None),
+                outside=design.plant.outside is not None,
+                tick=design.plant.tick,
                 wire=wires["recorder"],
             )
         return specs
@@ -173,7 +179,7 @@ class Launch:
             estimate = _row(files[i], self._sizes[i], k - 1)
             if x is not None and estimate is not None:
                 errors[i] = float(np.sqrt(np.mean((estimate[:n] - x) ** 2)))
-        show(Progress(self._finished(steps), errors, self._supervisor.waiting()))
+        show(Progress(self._finished(steps), errors, self._supervisor.note or self._supervisor.waiting()))
         return sum(sizes.values())
 
 
@@ -242,21 +248,18 @@ def run_in_process(
     took = time.monotonic() - begin
     rounds = len(trace.t)
     counts: dict[str, Any] = {"rounds": rounds, "rounds_per_second": rounds / took}
-    marked = () if trace.flagged is None else trace.flagged.sum(axis=1).tolist()
-    flags = dict(zip(trace.node_ids.tolist(), marked, strict=False))
-    warnings = _flagged(design, flags, counts)
+    warnings = _flagged(trace)
+    if design.scenario.run.inputs:
+        warnings += ("run.inputs: a run in one process keeps no tapes; only node processes do",)
     return _finish(folder, design, trace, counts, record=record, warnings=warnings)
 
 
-def _flagged(design: Design, flags: Mapping[int, int], counts: dict[str, Any]) -> tuple[str, ...]:
-    """Under faults, count the estimates that their own nodes mark and warn of them: the verdict does not see them."""
-    if not design.scenario.patchy:
-        return ()
-    counts["flagged"] = {str(i): flags.get(i, 0) for i in design.nodes}
-    steps = design.scenario.run.steps
+def _flagged(trace: Trace) -> tuple[str, ...]:
+    """Where messages can be missing, warn of the estimates that their own nodes mark."""
+    counts = () if trace.flagged is None else trace.flagged.sum(axis=1).tolist()
     return tuple(
-        f"node-{i} flags {count} of its {steps} estimates: messages were missing that it needs for them"
-        for i, count in flags.items()
+        f"node-{i} flags {count} of its {len(trace.t)} estimates: messages were missing that it needs for them"
+        for i, count in zip(trace.node_ids.tolist(), counts, strict=False)
         if count
     )
 
@@ -292,10 +295,15 @@ def gather(folder: RunFolder, design: Design, supervisor: Supervisor, seconds: f
     }
     recorder = supervisor.processes.get("recorder")
     warnings = [f"{p.who}: {text}" for p in supervisor.processes.values() for text in p.warnings]
-    flags = {i: said[f"node-{i}"]["flagged"] for i in design.nodes if said.get(f"node-{i}")}
-    warnings += _flagged(design, flags, counts)
+    warnings += _flagged(trace)
     if design.scenario.patchy:
         counts["faults"] = {what: sum(node["faults"].get(what, 0) for node in nodes) for what in COUNTED}
+    if design.scenario.timing.tick:
+        counts["timing"] = timeliness(design.scenario, said)
+        warnings += untimely(counts["timing"], design.plant.steps)
+    if held := said.get("gateway", {}).get("held"):
+        counts["held"] = held
+        warnings += [f"{key}: {n} samples were late; the last value before was used" for key, n in held.items()]
     lost = recorder is not None and not recorder.done
     if recorder and lost:
         warnings.append(f"{recorder.death()}; the recording was made from the trace instead")
@@ -321,4 +329,5 @@ def _finish(
     report = metrics(trace, design.scenario, counts)
     (folder.root / "metrics.json").write_text(json.dumps(report, indent=2) + "\n")
     folder.tidy()
-    return RunResult(folder.root, trace, report, bool(report["converged"]), warnings)
+    good = report["agree"] if design.scenario.outside else report["converged"]
+    return RunResult(folder.root, trace, report, bool(good), warnings)

@@ -23,6 +23,7 @@ from typing import Any
 
 import setproctitle
 
+import duio_mesh.gateway
 import duio_mesh.node
 import duio_mesh.observers
 import duio_mesh.plant
@@ -44,6 +45,7 @@ def _run_recorder(spec: RecorderSpec, report: Report) -> None:
 KINDS: dict[str, tuple[Any, Any]] = {
     "node": (NodeSpec, duio_mesh.node.run),
     "plant": (PlantSpec, duio_mesh.plant.run),
+    "gateway": (PlantSpec, duio_mesh.gateway.run),
     "recorder": (RecorderSpec, _run_recorder),
 }
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from queue import Empty
 
 import numpy as np
@@ -18,6 +19,7 @@ from duio_mesh.errors import RunError
 from duio_mesh.journal import Journal
 from duio_mesh.mesh import Mesh, Source
 from duio_mesh.mesh.lockstep import soon
+from duio_mesh.mesh.pace import Pace
 from duio_mesh.mesh.rejoin import ASK, admit
 from duio_mesh.process import Report, main
 from duio_mesh.spec import PATIENCE, PlantSpec, blocks
@@ -91,6 +93,15 @@ class Credits:
         if said:
             self._report("moving")
 
+    def listen(self, seconds: float) -> None:
+        """Take the next word of a node, if there is one within so many seconds."""
+        with suppress(Empty):
+            self._take(seconds)
+
+    def behind(self, steps: int) -> list[str]:
+        """The nodes that have not finished so many steps, and where they are."""
+        return [f"node-{i} (at step {self._done[i]})" for i in self._late(steps)]
+
     def _take(self, timeout: float) -> None:
         got = self._mesh.get(timeout)
         if got is None:  # somebody has gone
@@ -114,15 +125,20 @@ def run(spec: PlantSpec, report: Report) -> None:
     plant = Plant(spec)
     with Mesh(spec.wire, "plant", report.warn) as mesh:
         keys, ids = mesh.keys, [s.id for s in spec.sensors]
-        nodes = {i: mesh.hear(keys.credit(i), f"{i} -> plant", f"node-{i}", ready=(i, "plant")) for i in ids}
+        nodes = {i: mesh.hear(keys.credit(i), f"{i} -> plant", f"node-{i}") for i in ids}
         samples = {i: mesh.speak([(keys.plant(i), f"plant -> {i}", ("plant", i))]) for i in ids}
         mesh.watch()
         mesh.meet()
-        truth = mesh.speak([(keys.truth(), "plant -> recorder", ("plant", "recorder"))], drop=True)
-        if spec.recorded and mesh.unanswered(RECORDER):  # it then reads what it missed from the journals
+        truth = mesh.speak([(keys.truth(), "plant -> recorder", ("plant", "recorder"))], drop=not spec.kept)
+        if spec.kept:
+            mesh.meet()
+        elif spec.recorded and mesh.unanswered(RECORDER):  # it then reads what it missed from the journals
             report.warn(f"the recorder was not there after {RECORDER:g} s; starting without it")
+        for i in ids:  # not before everybody is there: from now on a sample comes within a node's deadline
+            mesh.announce((i, "plant"))
         report("ready")
         credits, begin, cpu = Credits(mesh, nodes, spec, report), time.monotonic(), time.process_time()
+        pace = Pace(spec, credits)
         rows: dict[int, list[Array]] = {}
         with Journal(spec.output, plant.x.size, truth) as journal:
             for block in blocks(0, spec.steps, spec.block, spec.returns):
@@ -130,6 +146,7 @@ def run(spec: PlantSpec, report: Report) -> None:
                 credits.wait(block.stop - spec.window)
                 if back := credits.admit(block.start):
                     admit(samples, block.start, back, credits.away, {i: data[-1] for i, data in rows.items()})
+                pace.until(block.start)
                 rows = {i: [] for i in ids}
                 for _ in block:
                     for i, data in plant.sample().items():
@@ -148,6 +165,7 @@ def run(spec: PlantSpec, report: Report) -> None:
             cpu_seconds=time.process_time() - cpu,
             frames=frames,
             rejected=mesh.rejections(),
+            timing=pace.said,
         )
 
 

@@ -96,7 +96,8 @@ def main(kind: type[Spec], run: Callable[[Spec, Report], None]) -> NoReturn:
     """The command line of one process, for containers and hosts without the launcher."""
     parser = argparse.ArgumentParser(description=f"Run one process of a duio_mesh run from its {kind.__name__}.")
     parser.add_argument("--spec", type=Path, required=True, help="spec file that the launcher or an export wrote")
+    parser.add_argument("--log", type=Path, help="also append what it reports to this file, as JSON lines")
     args = parser.parse_args()
-    code = live(kind, run, args.spec, Report(args.spec.stem, 1))
+    code = live(kind, run, args.spec, Report(args.spec.stem, 1, args.log))
     sys.stderr.flush()
     os._exit(code)  # everything is closed; a thread that still talks to a frozen peer must not keep us

@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import signal
 import time
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from queue import Empty, SimpleQueue
 
-from duio_mesh.journal import ASIDE, PERIOD, aside, map_rows
+from duio_mesh.journal import ASIDE, MISSING, PERIOD, aside, map_rows, missing
+from duio_mesh.ledger import Ledger
 from duio_mesh.mesh import Frame, Mesh, Source
 from duio_mesh.observers.watch import COLUMNS
 from duio_mesh.process import Report, main
@@ -38,10 +39,11 @@ class Rates:
 
 
 def run(spec: RecorderSpec, report: Report) -> None:
-    """Record until SIGTERM, then complete and close the recording."""
+    """Record until SIGTERM (with ``kept`` also until nobody is left), then complete and close the recording."""
     finishing = SimpleQueue[None]()
     changes = SimpleQueue[tuple[str, bool]]()
-    with Recording(spec) as recording, Mesh(spec.wire, "recorder", report.warn) as mesh:
+    writing = Ledger(spec) if spec.kept else nullcontext()
+    with writing as ledger, Recording(spec) as recording, Mesh(spec.wire, "recorder", report.warn) as mesh:
 
         def finish(*_: object) -> None:
             finishing.put(None)
@@ -51,7 +53,8 @@ def run(spec: RecorderSpec, report: Report) -> None:
         keys = mesh.keys
         node_of: dict[Source, int | None] = {}
         for i in spec.sizes:
-            node_of[mesh.hear(keys.trace(i), f"{i} -> recorder", f"node-{i}")] = i
+            ready = (i, "recorder") if spec.kept else None  # then the node waits for us
+            node_of[mesh.hear(keys.trace(i), f"{i} -> recorder", f"node-{i}", ready)] = i
         # last, because the plant starts when it sees this one
         node_of[mesh.hear(keys.truth(), "plant -> recorder", "plant", ("plant", "recorder"))] = None
         mesh.watch(lambda member, alive: changes.put((member.who, alive)))
@@ -59,13 +62,17 @@ def run(spec: RecorderSpec, report: Report) -> None:
         newest = {"plant": 0} | {f"node-{i}": 0 for i in spec.sizes}
         pause = PERIOD if spec.live else RATE_PERIOD
         rates, due = Rates(recording), time.monotonic() + pause
-        while finishing.empty() or mesh.pending():
+        while (finishing.empty() and not (ledger and ledger.over())) or mesh.pending():
             with suppress(Empty):
                 if got := mesh.get(PERIOD):
                     source, frame = got
-                    newest[source.who] = _keep(recording, spec, node_of[source], frame)
+                    if ledger:
+                        ledger.take(source.who, frame)
+                    newest[source.who] = max(newest[source.who], _keep(recording, spec, node_of[source], frame))
             while not changes.empty():
                 who, alive = changes.get()
+                if ledger:
+                    ledger.changed(who, alive)
                 if who in newest:
                     recording.liveness(who, "up" if alive else "down", max(0, newest[who] - 1))
             if time.monotonic() >= due:
@@ -77,6 +84,9 @@ def run(spec: RecorderSpec, report: Report) -> None:
         )
         for i, path in spec.estimates.items():
             recording.rounds(i, map_rows(aside(path), COLUMNS))
+            recording.missing_neighbours(i, 0, map_rows(missing(path), 1)[:, 0])
+        for who, lack in ledger.missing().items() if ledger else ():
+            report.warn(f"{lack} of the {spec.steps} rows of {who} did not come")
     report("done", cpu_seconds=time.process_time(), rejected=mesh.rejections())
 
 
@@ -84,6 +94,9 @@ def _keep(recording: Recording, spec: RecorderSpec, node: int | None, frame: Fra
     """Hand one batch to the recording; the step after its last row."""
     if node is not None and frame.r == ASIDE:
         recording.rounds(node, frame.vector.reshape(-1, COLUMNS))
+        return frame.k
+    if node is not None and frame.r == MISSING:
+        recording.missing_neighbours(node, frame.k, frame.vector)
         return frame.k
     rows = frame.vector.reshape(-1, spec.n if node is None else spec.sizes[node])
     if node is None:

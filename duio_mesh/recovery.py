@@ -23,8 +23,8 @@ class Recovery:
         if not lost.who.startswith("node-"):
             return False
         supervisor, who = self._supervisor, lost.who
-        supervisor.note("death", who=who, text=lost.death())
-        if self._policy == "degrade" or supervisor.processes["plant"].code == 0:
+        supervisor.remember("death", who=who, text=lost.death())
+        if self._policy == "degrade" or supervisor.source_done():
             lost.there = False
             lost.warnings.append(f"{lost.death()}; the others went on without it")
             return True

@@ -4,6 +4,7 @@ scenario.yaml  certificate.json  trace.npz  recording.rrd  metrics.json     writ
 nodes/node-3.spec  nodes/plant.spec  nodes/recorder.spec                    what each process was given (mode 0600)
 logs/node-3.jsonl  logs/node-3.err                                          events; whatever went to stderr
 rows/node-3.f64    rows/plant.f64    rows/node-3.f64.aside                  removed once trace.npz holds them
+inputs/node-3.tape                                                          when asked for: see tape.py (mode 0600)
 keys/node-3/key.pem  ...                                                    removed at the end (mode 0600 until then)
 """
 
@@ -11,6 +12,7 @@ from __future__ import annotations
 
 import os
 import shutil
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -65,6 +67,10 @@ class RunFolder:
         """The journal of a process."""
         return self.root / "rows" / f"{who}.f64"
 
+    def inputs(self, who: str) -> Path:
+        """The tape of a node."""
+        return self.root / "inputs" / f"{who}.tape"
+
     def log(self, who: str, kind: str) -> Path:
         """The log (kind ``jsonl``) or standard error (``err``) of a process."""
         return self.root / "logs" / f"{who}.{kind}"
@@ -76,7 +82,17 @@ class RunFolder:
         rows = {i: map_rows(self.rows(f"node-{i}"), size) for i, size in sizes.items()}
         steps = max(map(len, rows.values()))
         watched = {i: np.array(map_rows(aside(self.rows(f"node-{i}")), COLUMNS)) for i in sizes}
-        return split_trace(design, _padded(x, steps), {i: _padded(r, steps) for i, r in rows.items()}, watched)
+        trace = split_trace(design, _padded(x, steps), {i: _padded(r, steps) for i, r in rows.items()}, watched)
+        return replace(trace, samples=self._samples(design, steps))
+
+    def _samples(self, design: Design, steps: int) -> dict[int, Array]:
+        """What a gateway handed on to every node; {} when the plant was simulated."""
+        if (outside := design.plant.outside) is None:
+            return {}
+        widths = outside.widths()
+        rows = _padded(map_rows(self.rows("gateway"), sum(widths.values())), steps)
+        ends = np.cumsum(list(widths.values()))
+        return {i: rows[:, end - width : end] for (i, width), end in zip(widths.items(), ends, strict=True)}
 
     def tidy(self) -> None:
         """Remove the journals (they are in trace.npz now) and empty files of standard error."""

@@ -12,7 +12,7 @@ from duio_mesh.dynamics import Plant
 from duio_mesh.errors import RunError
 from duio_mesh.faults import Reception, Stamp
 from duio_mesh.observers import make_observer
-from duio_mesh.observers.absence import Late, flagged, neighbours_mean, part_with, start_again, take_late, welcome
+from duio_mesh.observers.absence import Late, neighbours_mean, part_with, start_again, take_late, welcome
 from duio_mesh.observers.base import NOTHING, reader
 from duio_mesh.observers.watch import watcher
 from duio_mesh.spec import NodeSpec
@@ -53,13 +53,12 @@ def simulate(design: Design, progress: Callable[[int], None] = lambda _: None) -
         for node in nodes.values():
             node.write(done - k)
         progress(done)
-    trace = split_trace(
+    return split_trace(
         design,
         np.array(truth),
         {i: np.array(node.rows) for i, node in nodes.items()},
         {i: np.concatenate(node.seen) for i, node in nodes.items()},
     )
-    return replace(trace, flagged=np.array([nodes[int(i)].marks for i in trace.node_ids]))
 
 
 class _Node:
@@ -67,7 +66,7 @@ class _Node:
 
     def __init__(self, spec: NodeSpec) -> None:
         self.spec, self.present = spec, True
-        self.rows, self.marks, self.seen = list[Array](), list[bool](), list[Array]()
+        self.rows, self.seen = list[Array](), list[Array]()
         self._missing = np.full(sum(part.size for part in make_observer(spec).estimate()), np.nan)
         self.begin(spec.steps)
 
@@ -81,9 +80,7 @@ class _Node:
         """The rows of the steps that are done; of a node that is not there, NaN."""
         if not self.present:
             self.rows += [self._missing] * steps
-            self.marks += [False] * steps
             return
-        self.marks += [flagged(self.observer)] * steps
         self.rows += [np.concatenate(estimate) for estimate in self._read()]
         self.seen.append(self._look())
 
@@ -91,6 +88,14 @@ class _Node:
 def _come_and_go(design: Design, nodes: dict[int, _Node], k: int, before: Mapping[int, Array]) -> None:
     """Processes that are killed at the beginning of step k, and those that are back."""
     faults = design.scenario.faults
+    for fault in faults.nodes:
+        if fault.step != k or fault.what == "pause":  # a pause only takes time
+            continue
+        if design.scenario.run.on_node_loss == "stop":
+            raise RunError(f"node-{fault.node} was killed at step {k}, as faults.nodes asks; run.on_node_loss is stop")
+        nodes[fault.node].present = False
+        for j in nodes[fault.node].spec.tells:
+            part_with(nodes[j].observer, fault.node)
     back = faults.returns().get(k, ())
     starts = {i: neighbours_mean(_told(nodes, i)) for i in back}  # before anybody of them is back
     for i in back:
@@ -103,14 +108,6 @@ def _come_and_go(design: Design, nodes: dict[int, _Node], k: int, before: Mappin
                 part_with(node.observer, j)
         for j in node.spec.tells:
             welcome(nodes[j].observer, i)
-    for fault in faults.nodes:
-        if fault.step != k or fault.what == "pause":  # a pause only takes time
-            continue
-        if design.scenario.run.on_node_loss == "stop":
-            raise RunError(f"node-{fault.node} was killed at step {k}, as faults.nodes asks; run.on_node_loss is stop")
-        nodes[fault.node].present = False
-        for j in nodes[fault.node].spec.tells:
-            part_with(nodes[j].observer, fault.node)
 
 
 def _told(nodes: Mapping[int, _Node], i: int) -> list[Array]:
@@ -139,21 +136,28 @@ class _InEdges:
 
 
 def split_trace(design: Design, x: Array, rows: dict[int, Array], watched: Mapping[int, Array]) -> Trace:
-    """Cut every node's rows [x-hat | w-hat | v-hat] (K, size) into the named arrays of a trace.
+    """Cut every node's rows [x-hat | w-hat | v-hat | flag] (K, size) into the named arrays of a trace.
 
+    There is a flag where messages can be missing. A row of NaN is a step without an estimate, and not flagged; an
+    estimate that has left the floats is flagged whatever the node says.
     ``watched``: every node's rows (m, 3) of the rounds of one step; m = 0 where none was watched.
     """
     n, ids = design.scenario.plant.n, sorted(rows)
     q, r = reconstructs(design)
     xhat = np.stack([rows[i][:, :n] for i in ids])
+    flagged = None
+    if all(design.nodes[i].without for i in ids):
+        flags = np.stack([rows[i][:, -1] for i in ids])
+        flagged = (flags > 0) | (~np.isnan(flags) & ~np.isfinite(xhat).all(axis=2))
     return Trace(
         t=np.arange(x.shape[0], dtype=np.float64) * design.plant.step,
         x=x,
         node_ids=np.array(ids, dtype=np.int64),
         xhat=xhat,
         what=np.stack([rows[i][:, n : n + q] for i in ids]) if q else None,
-        vhat={i: rows[i][:, n + q :] for i in ids if r[i]},
+        vhat={i: rows[i][:, n + q : n + q + r[i]] for i in ids if r[i]},
         rounds={i: rounds for i, rounds in watched.items() if len(rounds)},
+        flagged=flagged,
     )
 
 

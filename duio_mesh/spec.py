@@ -40,6 +40,11 @@ class Guard:
     tells: tuple[str, ...]  # processes to which it has something to tell
     dials: tuple[str, ...]  # processes that it connects to; the others connect to it
     limit: int  # bytes of the largest payload that it accepts
+    through: str = ""  # the router behind which all others are; "" where they are linked directly
+    probed: bool = False  # a health probe, with this process' own credentials, may ask whether it is alive
+    behind: Mapping[str, tuple[str, ...]] = dataclasses.field(default_factory=dict)
+    """Of a router: direct neighbour -> the processes that are reached through it."""
+    pairs: tuple[tuple[str, str], ...] = ()  # of a router: (source, target) of all that passes it
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,6 +55,8 @@ class Wire:
     listen: tuple[str, ...]  # Zenoh endpoints, e.g. tcp/127.0.0.1:7447
     connect: tuple[str, ...]
     guard: Guard | None = None  # None: whoever reaches a port may speak
+    mode: str = "peer"  # peer | client (of a router) | router
+    start: float = START  # seconds for all processes of a run to find each other
 
 
 UNWIRED = Wire("", (), ())
@@ -74,6 +81,8 @@ class NodeSpec:
     credit: int  # report progress to the plant every this many steps
     block: int  # steps whose samples the plant sends in one frame
     batch: int  # steps between two exchanges: 1, or as many as the observer fuses at once
+    tick: float = 0.0  # wall seconds per step; 0 is lockstep
+    wait: float = 0.0  # seconds from a sample's arrival in which all rounds of its step may wait
     faults: Incoming = UNDISTURBED  # on purpose, of its own in-edges
     spoils: Mapping[int, tuple[Rule, ...]] = dataclasses.field(default_factory=dict)  # of frames to out-neighbours
     without: str = ""  # what to do without a neighbour's message; "" where none can be missing
@@ -84,7 +93,10 @@ class NodeSpec:
     acts: tuple[NodeFault, ...] = ()  # on purpose, to this very process
     breaks: tuple[int, ...] = ()  # steps at which a block of samples ends early, because somebody comes back then
     incarnation: int = 0  # how many processes of this node were there before this one
+    outside: bool = False  # samples come from outside: they may take their time, and end before the last step
+    kept: bool = False  # no estimate may be lost on its way to the recorder, which writes them down
     output: str = ""  # file of this node's own estimates, float64 rows; "" keeps none
+    inputs: str = ""  # file of everything that the observer is given (duio_mesh.tape); "" keeps none
     wire: Wire = UNWIRED
 
 
@@ -97,6 +109,25 @@ class SensorSpec:
     known: tuple[int, ...]  # columns of B
     channel: Array  # F_i (p, r)
     noise: Signals  # r signals
+
+
+@dataclasses.dataclass(frozen=True)
+class Outside:
+    """Where the samples come from when no plant is simulated: publishers on a Zenoh network; see duio_mesh.gateway."""
+
+    listen: str  # Zenoh endpoint where publishers connect; "" when the gateway connects to a router
+    connect: str
+    encoding: str  # one of duio_mesh.sensors.messages.ENCODINGS
+    feeds: Mapping[int, tuple[str, ...]]  # node -> keys whose numbers, one after the other, are [y_i; u_i]
+    sizes: Mapping[str, int]  # key -> numbers in each of its messages
+    strays: str  # key expression of the same form as the keys; what else comes on it is refused and counted. "": none
+    end: str  # key on which a publisher says that it is over; "": nobody does
+    hold: float  # seconds after a step's first sample in which the others may come; infinite: up to the deadline
+    start_within: float  # seconds in which every sensor must have spoken
+
+    def widths(self) -> dict[int, int]:
+        """Numbers in [y_i; u_i], by ascending node: a row of a gateway's journal holds them one after the other."""
+        return {i: sum(self.sizes[key] for key in self.feeds[i]) for i in sorted(self.feeds)}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -118,8 +149,12 @@ class PlantSpec:
     deadline: float
     on_loss: str = "stop"  # when a node is lost
     returns: Mapping[int, tuple[int, ...]] = dataclasses.field(default_factory=dict)  # step: nodes to wait for there
+    tick: float = 0.0  # wall seconds per step; 0: as fast as the slowest node
+    wait: float = 0.0  # least seconds between two samples when it is behind the wall clock
     recorded: bool = False  # there is a recorder to wait for, a little
-    output: str = ""  # file of the true state, float64 rows
+    kept: bool = False  # it must be there, and no row may be lost on its way to it
+    output: str = ""  # file of the true state (of a gateway: of all samples), float64 rows
+    outside: Outside | None = None  # a gateway takes the plant's place
     wire: Wire = UNWIRED
 
 
@@ -129,7 +164,7 @@ class RecorderSpec:
 
     name: str
     n: int
-    sizes: Mapping[int, int]  # node id -> floats per estimate row (n, plus what a method reconstructs)
+    sizes: Mapping[int, int]  # node id -> floats per estimate row (n, plus what a method reconstructs, plus the flag)
     arcs: tuple[tuple[int, int], ...]
     step: float  # seconds between samples
     steps: int
@@ -139,14 +174,32 @@ class RecorderSpec:
     truth: str  # the plant's output file and ...
     estimates: Mapping[int, str]  # ... the nodes': rows that never arrived are read from here at the end
     unknown_inputs: int = 0  # of a row's columns after the n states, so many estimate w; the rest the node's own noise
+    flags: bool = False  # the last column of a row says whether the node marks its estimate
     watch_step: int | None = None  # a step whose rounds the nodes tell one by one
+    outside: bool = False  # nobody knows the true state: the errors are distances from the mean estimate
+    tick: float = 0.0  # wall seconds per step, and nodes tell which neighbours were missing; 0 is lockstep
+    kept: bool = False  # write all rows down as they come: their own journals are on other hosts
     wire: Wire = UNWIRED
 
 
-Spec = TypeVar("Spec", NodeSpec, PlantSpec, RecorderSpec)
+@dataclasses.dataclass(frozen=True)
+class RouterSpec:
+    """The router process of one host: it carries what processes of hosts that cannot reach each other say."""
+
+    who: str  # router-<host>
+    carries: tuple[str, ...]  # all processes of the run; once they have come and gone, so does the router
+    wire: Wire = UNWIRED
+
+
+AnySpec: TypeAlias = NodeSpec | PlantSpec | RecorderSpec | RouterSpec
+Spec = TypeVar("Spec", NodeSpec, PlantSpec, RecorderSpec, RouterSpec)
 
 _TYPES: dict[str, type[Any]] = {
-    t.__name__: t for t in (Guard, Wire, Rule, NodeFault, Incoming, NodeSpec, SensorSpec, PlantSpec, RecorderSpec)
+    t.__name__: t
+    for t in (
+        *(Guard, Wire, Rule, NodeFault, Incoming, NodeSpec),
+        *(SensorSpec, Outside, PlantSpec, RecorderSpec, RouterSpec),
+    )
 }
 _ARRAY, _RECORD = 1, 2  # msgpack extension codes
 
@@ -189,9 +242,15 @@ def blocks(first: int, steps: int, block: int, breaks: Iterable[int] = ()) -> It
         first = end
 
 
-def write_spec(spec: NodeSpec | PlantSpec | RecorderSpec, path: Path) -> None:
+def packed(value: Any) -> bytes:
+    """Any part of a spec as msgpack. Raises TypeError for what a spec cannot hold."""
+    data: bytes = msgpack.packb(value, default=_pack)
+    return data
+
+
+def write_spec(spec: AnySpec, path: Path) -> None:
     """Write ``spec`` readable by its owner only (mode 0600)."""
-    data = msgpack.packb(spec, default=_pack)
+    data = packed(spec)
     with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "wb") as f:
         f.write(data)
 

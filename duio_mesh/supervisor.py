@@ -86,6 +86,7 @@ class Supervisor:
         """Start the nursery; it gets ready by itself while the caller goes on."""
         self.processes: dict[str, Process] = {}
         self.events: list[dict[str, Any]] = []  # what has happened to nodes on the way
+        self.note = ""  # what a gateway waits for
         self._begin = time.monotonic()
         self._beats = 0  # whatever anybody says shows that things move
         self._status, write = os.pipe()
@@ -157,7 +158,7 @@ class Supervisor:
             if any(p.code or (p.failure and not self._recovers(p, recover)) for p in self._essential()):
                 self._until(lambda: False, GATHER)
                 raise RunError(self._diagnosis())
-            if self.processes["plant"].code == 0:
+            if self.source_done():
                 self._end_the_late()
             now = time.monotonic()
             if limit is not None and now - begin > limit:
@@ -174,7 +175,11 @@ class Supervisor:
     @staticmethod
     def _recovers(process: Process, recover: Recover) -> bool:
         """Whether its failure may be survived, once it has ended."""
-        return recover is not None and process.who != "plant"
+        return recover is not None and process.who.startswith("node-")
+
+    def source_done(self) -> bool:
+        """Whether plant or gateway have sent their last sample and seen every node finish."""
+        return any(self.processes[who].code == 0 for who in ("plant", "gateway") if who in self.processes)
 
     def _end_the_late(self) -> None:
         """The plant is done, so whoever is not back in step has come too late."""
@@ -198,7 +203,7 @@ class Supervisor:
         found: dict[str, Process] = {}
         for p in self._essential():
             for who in p.waits.get("on", ()):
-                other = self.processes[who]
+                other = self.processes.get(who) or self.processes["gateway"]  # which is the plant to everybody
                 if other.there and (not other.waits or other.state()):
                     found[who] = other
         return list(found.values())
@@ -208,7 +213,7 @@ class Supervisor:
         now = time.monotonic()
         late = [p for p in self._essential() if p.waits and now - p.since > deadline]
         for p in self._roots() if late else ():
-            if p.who != "plant" and any(p.who in other.waits["on"] for other in late) and p.code is None:
+            if p.who.startswith("node-") and any(p.who in other.waits["on"] for other in late) and p.code is None:
                 p.warnings.append(f"kept {', '.join(o.who for o in late)} waiting for {deadline:g} s; killed")
                 self.kill(p.who, signal.SIGKILL)
 
@@ -282,6 +287,8 @@ class Supervisor:
             process.done = event
         elif what == "failed":
             process.failure = event["text"]
+        elif what == "sensors":
+            self.note = event["text"]
         elif what == "warning":
             process.warnings.append(event["text"])
         elif what == "started":
@@ -299,8 +306,8 @@ class Supervisor:
         elif what == "exit":
             process.code, process.waits = event["code"], {}
         if what in TOLD:
-            self.note(what, **{key: value for key, value in event.items() if key != "event"})
+            self.remember(what, **{key: value for key, value in event.items() if key != "event"})
 
-    def note(self, what: str, **fields: Any) -> None:
+    def remember(self, what: str, **fields: Any) -> None:
         """Keep an event for whoever wants to know afterwards what happened on the way."""
         self.events.append({"seconds": round(time.monotonic() - self._begin, 3), "event": what, **fields})

@@ -22,12 +22,28 @@ class Trace:
     vhat: dict[int, Array] = field(default_factory=dict)  # node id -> (K, r) where it reconstructs its noise
     rounds: dict[int, Array] = field(default_factory=dict)
     """Node id -> (m, 3) [round, residual, disagreement] of a watched step; for the recording, not in trace.npz."""
+    samples: dict[int, Array] = field(default_factory=dict)
+    """Node id -> (K, p + m) [y_i; u_i] as they came from outside; {} when the plant was simulated."""
     flagged: NDArray[np.bool_] | None = None
-    """(N, K) estimates that the node itself marks as not to be trusted; only the oracle keeps them so far."""
+    """(N, K) estimates that the node itself marks as not to be trusted; None where no message can be missing."""
+
+    @property
+    def lost(self) -> NDArray[np.bool_]:
+        """(N, K) steps of which a node has no estimate, in a run that goes on without it.
+
+        There are none where no message can be missing: such a run ends with its first loss. An estimate that has left
+        the floats is NaN too, but it is one, and it is flagged.
+        """
+        if self.flagged is None:
+            return np.zeros(self.xhat.shape[:2], dtype=bool)
+        return np.asarray(np.isnan(self.xhat).all(axis=2) & ~self.flagged)
 
     def arrays(self) -> dict[str, NDArray[np.generic]]:
         """The arrays under the names of trace.npz."""
         named: dict[str, NDArray[np.generic]] = {"t": self.t, "x": self.x, "node_ids": self.node_ids, "xhat": self.xhat}
         if self.what is not None:
             named["what"] = self.what
-        return named | {f"vhat_{i}": v for i, v in self.vhat.items()}
+        if self.flagged is not None:
+            named["flagged"] = self.flagged
+        named |= {f"vhat_{i}": v for i, v in self.vhat.items()}
+        return named | {f"sample_{i}": s for i, s in self.samples.items()}

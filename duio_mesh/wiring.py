@@ -10,6 +10,7 @@ import ipaddress
 import secrets
 import socket
 from pathlib import Path
+from typing import Protocol
 
 from duio_mesh import credentials
 from duio_mesh.errors import ScenarioError
@@ -41,6 +42,37 @@ def _is_loopback(address: str) -> bool:
         return address == "localhost"
 
 
+class Links:
+    """Who dials whom, and who has something to tell whom, by names of processes."""
+
+    def __init__(self, design: Design, *, record: bool) -> None:
+        names = {i: f"node-{i}" for i in sorted(design.nodes)}
+        self.dials: dict[str, tuple[str, ...]] = {"plant": ()}
+        self.hears: dict[str, tuple[str, ...]] = {"plant": tuple(names.values())}  # their credits
+        for i, spec in design.nodes.items():
+            near = {*spec.hears, *spec.tells}
+            self.dials[names[i]] = ("plant", *(names[j] for j in sorted(near) if j < i))
+            self.hears[names[i]] = ("plant", *(names[j] for j in sorted(spec.hears)))
+        if record:
+            self.dials["recorder"] = self.hears["recorder"] = ("plant", *names.values())
+
+    def tells(self, who: str) -> tuple[str, ...]:
+        """Those that ``who`` has something to tell."""
+        return tuple(other for other, heard in self.hears.items() if who in heard)
+
+
+class Wired(Protocol):
+    """Whoever knows the wire of every process."""
+
+    def wires(self) -> dict[str, Wire]:
+        """By process."""
+        ...
+
+    def release(self) -> None:
+        """The processes have started."""
+        ...
+
+
 class Wiring:
     """The wires of one run; holds the ports until ``release``."""
 
@@ -52,24 +84,16 @@ class Wiring:
         self._run = secrets.token_hex(4)
         self._limit = largest_frame(design)
         self._held: list[socket.socket] = []
-        ids = sorted(design.nodes)
-        near = {i: {*spec.hears, *spec.tells} for i, spec in design.nodes.items()}
-        names = {i: f"node-{i}" for i in ids}
-        self._dials: dict[str, tuple[str, ...]] = {"plant": ()}
-        self._hears: dict[str, tuple[str, ...]] = {"plant": tuple(names.values())}  # their credits
-        for i, spec in design.nodes.items():
-            self._dials[names[i]] = ("plant", *(names[j] for j in sorted(near[i]) if j < i))
-            self._hears[names[i]] = ("plant", *(names[j] for j in sorted(spec.hears)))
-        if record:
-            self._dials["recorder"] = self._hears["recorder"] = ("plant", *names.values())
+        self._links = Links(design, record=record)
 
     def wires(self) -> dict[str, Wire]:
         """The wire of every process; its port is reserved, its credentials are written."""
         link = "tls" if self._security.mode == "mtls" else "tcp"
-        at = {who: f"{link}/{self._address}:{self._reserve()}" for who in self._dials if who != "recorder"}
+        dials = self._links.dials
+        at = {who: f"{link}/{self._address}:{self._reserve()}" for who in dials if who != "recorder"}
         folders: dict[str, Path] = {}
         if self._security.mode != "open":
-            folders = credentials.issue(self._keys, self._security.mode, self._run, self._dials, self._address)
+            folders = credentials.issue(self._keys, self._security.mode, self._run, dials, self._address)
         return {
             who: Wire(
                 run=self._run,
@@ -77,7 +101,7 @@ class Wiring:
                 connect=tuple(at[other] for other in dialled),
                 guard=self._guard(who, folders[who]) if who in folders else None,
             )
-            for who, dialled in self._dials.items()
+            for who, dialled in dials.items()
         }
 
     def release(self) -> None:
@@ -90,9 +114,9 @@ class Wiring:
             mode=self._security.mode,
             who=who,
             folder=str(folder),
-            hears=self._hears[who],
-            tells=tuple(other for other, heard in self._hears.items() if who in heard),
-            dials=self._dials[who],
+            hears=self._links.hears[who],
+            tells=self._links.tells(who),
+            dials=self._links.dials[who],
             limit=self._limit,
         )
 

@@ -18,6 +18,11 @@ ROOT = Path(__file__).parent.parent
 TOPOLOGIES = ROOT / "topologies"
 
 
+def simulated() -> list[str]:
+    """Names of the topologies whose plant is simulated, so that there is an oracle; the others are fed from outside."""
+    return sorted(p.stem for p in TOPOLOGIES.glob("*.yaml") if "\nplant: external\n" not in p.read_text())
+
+
 def started_in(folder: Path) -> list[psutil.Process]:
     """Every other process that was started in this folder (the processes of a run inherit it)."""
     found = []

@@ -27,13 +27,18 @@ FLOORS = [
         "scenario",
         "observers",
         "mesh",
+        "sensors",
         "journal",
+        "ledger",
+        "tape",
     ],
     ["report", "process"],
-    ["synthesis", "simulation", "node", "plant", "recorder"],
+    ["links"],
+    ["synthesis", "simulation", "node", "plant", "gateway", "recorder", "router", "health"],
     ["nursery", "supervisor", "run_folder", "schema", "credentials", "wiring"],
+    ["recovery"],
     ["launcher"],
-    ["api", "console", "generate"],
+    ["api", "console", "generate", "replay", "deploy"],
     ["cli"],
 ]
 OUTSIDE = {  # what a room may import from outside the standard library
@@ -42,6 +47,7 @@ OUTSIDE = {  # what a room may import from outside the standard library
     "mesh": {"numpy", "zenoh", "msgpack"},
     "dynamics": {"numpy"},
     "faults": set(),
+    "tape": {"numpy", "msgpack"},
     "node": {"numpy"},
     "scenario": {"numpy", "pydantic", "pydantic_core", "ruamel"},
 }

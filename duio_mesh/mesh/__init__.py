@@ -7,6 +7,19 @@ from __future__ import annotations
 
 from duio_mesh.mesh.frames import Decoder, Encoder, Frame, Rejected
 from duio_mesh.mesh.keys import Keys
+from duio_mesh.mesh.outside import Heard, OutsideWorld
 from duio_mesh.mesh.session import Member, Mesh, Outlet, Source
 
-__all__ = ["Decoder", "Encoder", "Frame", "Keys", "Member", "Mesh", "Outlet", "Rejected", "Source"]
+__all__ = [
+    "Decoder",
+    "Encoder",
+    "Frame",
+    "Heard",
+    "Keys",
+    "Member",
+    "Mesh",
+    "Outlet",
+    "OutsideWorld",
+    "Rejected",
+    "Source",
+]

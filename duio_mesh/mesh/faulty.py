@@ -8,13 +8,14 @@ comes back.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Protocol
 
 from duio_mesh.arrays import Array
-from duio_mesh.faults import Edge, Reception, Stamp
+from duio_mesh.faults import Reception, Stamp
 from duio_mesh.mesh.lockstep import KNOCK, Line, LinkLost, Lockstep
 from duio_mesh.mesh.session import Outlet
+from duio_mesh.mesh.spoiler import Spoiler
 from duio_mesh.spec import NodeSpec
 
 LONG_WAY = 1_000_000
@@ -42,14 +43,12 @@ class FaultyExchange:
     def __init__(
         self, spec: NodeSpec, lockstep: Lockstep, told: Outlet, heard: Mapping[int, Line], listener: Told
     ) -> None:
-        self._lockstep, self._told, self._listener = lockstep, told, listener
+        self._lockstep, self._tell, self._listener = lockstep, Spoiler(spec, told), listener
         self._heard = dict(sorted(heard.items()))
         self._endures = spec.on_loss != "stop"
         self._reception = Reception(spec.faults, spec.hears)
         self._parted: set[int] = set()  # who is gone, planned or not
         self._sizes: dict[Stamp, int] = {}  # of frames on their long way
-        seed = spec.faults.seed
-        self._out = [Edge(seed, spec.id, j, spec.spoils[j]) if j in spec.spoils else None for j in spec.tells]
 
     @property
     def counts(self) -> Mapping[str, int]:
@@ -58,7 +57,7 @@ class FaultyExchange:
 
     def __call__(self, k: int, r: int, vector: Array) -> dict[int, Array]:
         """Send our vector of step k, round r; those of the same round that arrive in time, in ascending order of id."""
-        self._told.send_each(k, r, vector, lambda at, frame: self._spoilt(at, frame, k, r))
+        self._tell(k, r, vector)
         for j in self._heard:
             if j not in self._parted and self._reception.without(j, k):
                 self._part(j, k, r, "")
@@ -115,15 +114,3 @@ class FaultyExchange:
         while (sample := line.poll()) is not None:
             if (data := sample.payload.to_bytes()) != KNOCK:
                 self._lockstep.set_aside(line, data, k, r)
-
-    def _spoilt(self, at: int, frame: bytes, k: int, r: int) -> Iterable[bytes]:
-        edge = self._out[at]
-        if edge is None:
-            return (frame,)
-        fate = edge.fate(k, r)
-        if fate.corrupt:
-            flipped = bytearray(frame)
-            bit = int(fate.bit * 8 * len(frame))
-            flipped[bit // 8] ^= 1 << bit % 8
-            frame = bytes(flipped)
-        return (frame, frame) if fate.duplicate else (frame,)

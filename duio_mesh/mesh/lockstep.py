@@ -43,6 +43,10 @@ class LinkLost(RunError):
     """The other end of a link has gone."""
 
 
+class Ended(Exception):
+    """A patient line's sender has said that there will be no further step."""
+
+
 class Form(NamedTuple):
     """What a payload of ``size`` numbers looks like."""
 
@@ -95,6 +99,8 @@ class Line(Source):
     def knock(self) -> None:
         """Let ``receive`` return ``KNOCK``, after everything that has come."""
         self._mesh.tell_self(self._key, KNOCK)
+
+    patient = False  # its sender itself says when it has waited too long, and may end early by an empty frame
 
 
 class Lockstep:
@@ -181,6 +187,8 @@ class Lockstep:
     def _held(self, line: Line, k: int, r: int, size: int) -> Array | None:
         """The frame of step k, round r, if it came before it was due and has the right size."""
         vector = line.waiting.pop((k, r), None)
+        if line.patient and vector is not None and not vector.size:
+            raise Ended
         if vector is not None and vector.size != size:
             self._mesh.reject(line, f"{vector.size} numbers instead of {size}")
             return None
@@ -234,7 +242,7 @@ class Lockstep:
             if now - since > soon(self._deadline) and not told:
                 told = True
                 self._say("waiting", on=[line.who], link=line.name, k=k, r=r, waited=now - since)
-            if now - since > self._deadline:
+            if now - since > self._deadline and not line.patient:
                 line.late = at
             if line.gone or line.late is at:
                 line.knock()

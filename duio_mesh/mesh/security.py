@@ -7,11 +7,12 @@ lets each of them subscribe to exactly what is meant for it. Everything else is 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
 from duio_mesh.mesh.keys import Keys
+from duio_mesh.mesh.passage import passage
+from duio_mesh.mesh.rules import Grant, Party, data_key, identity, listed, probe, subscriptions
 from duio_mesh.spec import AUTHORITY, CERTIFICATE, KEY, PASSWORD, USERS, Guard, Wire
 
 OVERHEAD = 4096  # bytes of a Zenoh message that are not its payload: key expression, headers; far more than needed
@@ -30,7 +31,7 @@ def settings(wire: Wire) -> dict[str, Any]:
     keys = Keys(wire.run)
     return {
         "id": identity(wire.run, guard.who),
-        "access_control": access(keys, guard),
+        "access_control": (access if not guard.behind else passage)(keys, guard),
         "low_pass_filter": [
             {"id": "size", "flows": ["ingress"], "messages": ["put"], "key_exprs": ["**"], "size_limit": guard.limit}
         ],
@@ -43,75 +44,28 @@ def settings(wire: Wire) -> dict[str, Any]:
     }
 
 
-def identity(run: str, who: str) -> str:
-    """The Zenoh id of a process of a run: 32 hexadecimal digits, the first not 0.
-
-    Zenoh refuses a second peer with the id of one that is connected, so who steals a node's key cannot use it beside
-    the node itself.
-    """
-    return "d" + sha256(f"{run}/{who}".encode()).hexdigest()[:31]
-
-
-def _name(who: str) -> int | str:
-    """node-3 -> 3; plant and recorder stay what they are."""
-    return int(who.removeprefix("node-")) if who.startswith("node-") else who
-
-
-def data_key(keys: Keys, source: str, target: str) -> str:
-    """The key on which ``source`` tells ``target``. Raises ValueError when the first has nothing to tell the second."""
-    s, t = _name(source), _name(target)
-    match s, t:
-        case int(), int():
-            return keys.edge(s, t)
-        case int(), "plant":
-            return keys.credit(s)
-        case int(), "recorder":
-            return keys.trace(s)
-        case "plant", int():
-            return keys.plant(t)
-        case "plant", "recorder":
-            return keys.truth()
-    raise ValueError(f"{source} has nothing to tell {target}")
-
-
-def _subscriptions(keys: Keys, source: str, target: str) -> list[str]:
-    """What ``target`` declares in order to hear ``source``: its data subscriber, and the start barrier's."""
-    data = data_key(keys, source, target)
-    meets = not (source.startswith("node-") and target == "recorder")  # nobody waits for the recorder but the plant
-    return [data, keys.ready(_name(source), _name(target))] if meets else [data]
-
-
 def access(keys: Keys, guard: Guard) -> dict[str, Any]:
-    """Zenoh's ``access_control`` of this process: default deny, one subject and one policy per direct peer."""
-    rules: list[dict[str, Any]] = []
-    policies = []
-    subjects = []
-    for peer in sorted({*guard.hears, *guard.tells}):
-        own = [
-            {"id": f"{peer}: {flow} {message}", "permission": "allow", "flows": [flow], "messages": [message]}
-            | {"key_exprs": allowed}
-            for flow, message, allowed in _allowed(keys, guard, peer)
-        ]
-        rules += own
-        subjects.append({"id": peer} | _subject(keys.run, guard, peer))
-        policies.append({"rules": [rule["id"] for rule in own], "subjects": [peer]})
-    return {
-        "enabled": True,
-        "default_permission": "deny",
-        "rules": rules,
-        "subjects": subjects,
-        "policies": policies,
-    }
+    """Zenoh's ``access_control`` of this process: what each of the others may say to it and hear from it.
+
+    Where a router stands in between, it stands for all of them: who says what is then for the routers to see to.
+    """
+    peers = {peer: list(_allowed(keys, guard, peer)) for peer in sorted({*guard.hears, *guard.tells})}
+    if guard.through:
+        peers = {guard.through: [grant for grants in peers.values() for grant in grants]}
+    parties = {peer: Party(_subject(keys.run, guard, peer), grants) for peer, grants in peers.items()}
+    if guard.probed and not guard.through:  # else its probe asks the router
+        parties[f"{guard.who} probe"] = probe(keys, guard.who, {"cert_common_names": [guard.who]})
+    return listed(parties)
 
 
-def _allowed(keys: Keys, guard: Guard, peer: str) -> Iterator[tuple[str, str, list[str]]]:
+def _allowed(keys: Keys, guard: Guard, peer: str) -> Iterator[Grant]:
     """(flow, message, keys) of all that may pass between this process and one of its peers."""
     if peer in guard.hears:
         yield "ingress", "put", [data_key(keys, peer, guard.who)]
-        yield "egress", "declare_subscriber", _subscriptions(keys, peer, guard.who)
+        yield "egress", "declare_subscriber", subscriptions(keys, peer, guard.who)
     if peer in guard.tells:
         yield "egress", "put", [data_key(keys, guard.who, peer)]
-        yield "ingress", "declare_subscriber", _subscriptions(keys, guard.who, peer)
+        yield "ingress", "declare_subscriber", subscriptions(keys, guard.who, peer)
     yield "ingress", "liveliness_token", [keys.alive(f"{peer}/**")]
     yield "egress", "liveliness_token", [keys.alive(f"{guard.who}/**")]
     for flow in ("ingress", "egress"):

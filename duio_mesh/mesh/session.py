@@ -31,22 +31,22 @@ from duio_mesh.errors import RunError
 from duio_mesh.mesh import security
 from duio_mesh.mesh.frames import Decoder, Encoder, Frame, Rejected
 from duio_mesh.mesh.keys import Keys
-from duio_mesh.spec import START, Wire
+from duio_mesh.spec import Wire
 
 CLOSE = 2.0  # seconds to end a session in order
 
 Ready: TypeAlias = tuple[int | str, int | str]  # (source, target) of a link, for the start barrier
 
 
-def _config(wire: Wire) -> zenoh.Config:
-    """Peer mode, these endpoints and no others: no multicast, no gossip, no shared memory (payloads are small)."""
+def configured(wire: Wire) -> zenoh.Config:
+    """These endpoints and no others: no multicast, no gossip, no shared memory (payloads are small)."""
     config = zenoh.Config()
     settings: dict[str, Any] = {
-        "mode": "peer",
+        "mode": wire.mode,
         "listen/endpoints": list(wire.listen),
         "connect/endpoints": list(wire.connect),
         "connect/retry": {"period_init_ms": 10, "period_max_ms": 100, "period_increase_factor": 1.5},
-        "connect/timeout_ms": int(START * 1000),
+        "connect/timeout_ms": int(wire.start * 1000),
         "connect/exit_on_failure": True,
         "open/return_conditions/connect_scouted": False,  # else every open waits half a second for scouting
         "scouting/multicast/enabled": False,
@@ -137,7 +137,7 @@ class Mesh:
         Raises RunError when an endpoint cannot be used or reached.
         """
         self.who, self.keys, self._before = who, Keys(wire.run), before
-        self._warn = warn
+        self._warn, self._start = warn, wire.start
         self._queue: SimpleQueue[tuple[Source | Member, bytes | None]] = SimpleQueue()
         self.sources: list[Source] = []
         self._news = threading.Condition()
@@ -145,7 +145,7 @@ class Mesh:
         self._meeting: dict[str, Any] = {}  # name of a link -> publisher that must match before the start
         self._kept: list[Any] = []
         try:
-            self._session = zenoh.open(_config(wire))
+            self._session = zenoh.open(configured(wire))
         except zenoh.ZError as e:
             raise RunError(
                 f"{who} could not open its links (listen {wire.listen}, connect {wire.connect}): {e}"
@@ -186,12 +186,16 @@ class Mesh:
         """A Zenoh subscriber that lives as long as the mesh; ``ready`` announces it to the start barrier."""
         self._kept.append(subscriber := self._session.declare_subscriber(key, handler))
         if ready:  # after the data subscriber, on the same link: whoever sees this one can be heard
-            self._kept.append(self._session.declare_subscriber(self.keys.ready(*ready), zenoh.handlers.FifoChannel(1)))
+            self.announce(ready)
         return subscriber
 
     def tell_self(self, key: str, data: bytes) -> None:
         """Put a message into our own subscriber's channel; it does not leave this process."""
         self._session.put(key, data, allowed_destination=zenoh.Locality.SESSION_LOCAL)
+
+    def announce(self, ready: Ready) -> None:
+        """Answer the start barrier on this link, whose data subscriber is there already."""
+        self._kept.append(self._session.declare_subscriber(self.keys.ready(*ready), zenoh.handlers.FifoChannel(1)))
 
     def speak(self, links: Iterable[tuple[str, str, Ready | None]], drop: bool = False) -> Outlet:
         """Publish on every (key, name, ready) of ``links``; with ``drop`` a slow receiver costs frames, not time."""
@@ -228,12 +232,9 @@ class Mesh:
                 else:
                     self._here.discard(member)
                 self._news.notify_all()
-            if alive:
-                tell(member, True)
-                if member.before:  # the one before it is dead, though we may never have seen it announced
-                    tell(Member(who, member.before - 1), False)
-            else:
-                tell(member, False)
+            if alive and member.before:  # the one before it is dead, though we may never have seen it announced
+                tell(Member(who, member.before - 1), False)
+            tell(member, alive)
 
         everyone = self.keys.alive("**")
         self._kept.append(self._session.liveliness().declare_subscriber(everyone, _at_once(seen), history=True))
@@ -256,11 +257,12 @@ class Mesh:
 
     # -- the start barrier ------------------------------------------------------------------------------------------
 
-    def meet(self, timeout: float = START) -> None:
+    def meet(self, timeout: float | None = None) -> None:
         """Wait until every link that was declared so far has somebody at its other end.
 
-        Raises RunError naming the links that nobody answered.
+        Raises RunError naming the links that nobody answered within ``timeout`` seconds (default: the wire's start).
         """
+        timeout = self._start if timeout is None else timeout
         if missing := ", ".join(self.unanswered(timeout)):
             raise RunError(f"{self.who}: nobody answered on {missing} within {timeout:g} s of the start")
 
@@ -290,8 +292,9 @@ class Mesh:
         Bad frames are counted at their source, warned about once per cause, and dropped. Raises ``queue.Empty`` when
         nothing came for ``timeout`` seconds.
         """
+        end = time.monotonic() + timeout  # bad frames do not put it off
         while True:
-            source, data = self._queue.get(timeout=timeout)
+            source, data = self._queue.get(timeout=max(0.0, end - time.monotonic()))
             if isinstance(source, Member):
                 self.bury(source)
                 return None

@@ -153,8 +153,11 @@ class _Guard:
         self._inner.resume(x, y, u)
 
     def estimate(self) -> Estimate:
-        """As the method has."""
-        return self._inner.estimate()
+        """As the method has, and the mark."""
+        return self._marked(self._inner.estimate())
+
+    def _marked(self, estimate: Estimate) -> Estimate:
+        return estimate._replace(flag=np.array([float(self.flagged)]))
 
 
 class Coupled(_Guard):
@@ -281,14 +284,14 @@ class Fused(_Guard):
 
     def estimate(self) -> Estimate:
         """Of the newest sample."""
-        return self._results[-1] if self.batch() else self._inner.estimate()
+        return self._results[-1] if self.batch() else super().estimate()
 
     def batch(self) -> Sequence[Estimate]:
         """Of every sample since the last rounds."""
         if not self._results and self._inputs:
             doubtful = self._AB is not None and self.flagged
             found = self._predicted() if doubtful else [e.state.copy() for e in reader(self._inner)()]
-            self._results = [Estimate(x) for x in found]
+            self._results = [self._marked(Estimate(x)) for x in found]
         return self._results
 
     def _predicted(self) -> list[Array]:

@@ -32,6 +32,7 @@ class Estimate(NamedTuple):
     state: Array  # x-hat (n,)
     unknown_input: Array = NOTHING  # w-hat (q,) where the method reconstructs it
     noise: Array = NOTHING  # v-hat (r,) where the method reconstructs it
+    flag: Array = NOTHING  # (1,) where messages can be missing: 1 marks an estimate that is not to be trusted, else 0
 
 
 class Observer(Protocol):

@@ -9,9 +9,10 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from duio_mesh.report.entities import DESCRIPTION, EVENTS, RATES, STATES, TRUTH, WATCHED, Entities, spread
+from duio_mesh.report.entities import DESCRIPTION, EVENTS, FLAGS, GAPS, RATES, STATES, TRUTH, WATCHED, Entities, spread
 from duio_mesh.report.topology import positions
 
+DISTANCE = "Distance from the mean estimate: log10 ‖x̂ − mean‖"  # where nobody knows the true state
 VIEWS = 12  # states that are shown side by side
 LINES = 16  # nodes whose lines share a view, and nodes with a tab of their own
 LEGEND = 12  # lines that a legend names
@@ -42,6 +43,7 @@ def styles(entities: Entities, description: str) -> Iterator[tuple[str, Any]]:
         yield path, _line("truth", TRUTH, 4.0)
     for i in entities.ids:
         watched = [entities.rounds(kind, i) for kind in WATCHED if entities.spec.watch_step is not None]
+        watched += [entities.gap(i)] if entities.spec.tick else []
         for path in (entities.error(i), entities.rate(f"node-{i}"), *watched):
             yield path, _line(f"node {i}", entities.colours[i], 1.5)
         for _, path in entities.estimates(i):
@@ -51,11 +53,14 @@ def styles(entities: Entities, description: str) -> Iterator[tuple[str, Any]]:
     lanes = rr.StateConfiguration(values=list(STATES), colors=np.array(list(STATES.values()), dtype=np.uint32))
     for who in ("plant", *(f"node-{i}" for i in entities.ids)):
         yield entities.alive(who), lanes
+    marks = rr.StateConfiguration(values=list(FLAGS), colors=np.array(list(FLAGS.values()), dtype=np.uint32))
+    for i in entities.ids if entities.spec.flags else ():
+        yield entities.flag(i), marks
     yield from _map(entities)
 
 
 def states(values: list[str]) -> Any:
-    """How a process is, as a column of its lane."""
+    """How a process or an estimate is, as a column of its lane."""
     return rr.StateChange.columns(state=values)
 
 
@@ -102,15 +107,17 @@ def _map(entities: Entities) -> Iterator[tuple[str, Any]]:
 
 def _overview(entities: Entities) -> rrb.Container:
     errors = _plot(
-        "Estimation error: log10 ‖x̂ − x‖",
+        DISTANCE if entities.spec.outside else "Estimation error: log10 ‖x̂ − x‖",
         [entities.error(i) for i in entities.ids],
         legend=len(entities.ids) <= LEGEND,
     )
-    lanes = rrb.StateTimelineView(origin="/alive", name="Processes", time_view=_whole_run())
+    lanes = [rrb.StateTimelineView(origin="/alive", name="Processes", time_view=_whole_run())]
+    if entities.spec.flags:
+        lanes.append(rrb.StateTimelineView(origin="/flag", name="Each node about its estimate", time_view=_whole_run()))
     columns = rrb.TextLogColumns(text_log_columns=["LogLevel", "Body"])
     log = rrb.TextLogView(origin=EVENTS, name="Events", columns=columns)
     return rrb.Horizontal(
-        rrb.Vertical(errors, lanes, row_shares=[3, 2]),
+        rrb.Vertical(errors, *lanes, row_shares=[6, 5, 4] if entities.spec.flags else [3, 2]),
         rrb.Vertical(_topology(entities), log, row_shares=[3, 2]),
         column_shares=[5, 3],
         name="Overview",
@@ -184,8 +191,11 @@ def _run(entities: Entities, rates: bool) -> rrb.Container:
     document = rrb.TextDocumentView(origin=DESCRIPTION, name="What was run")
     if not rates:
         return rrb.Horizontal(document, name="Run")
-    plot = _plot("Steps per second", [f"{RATES}/**"], legend=len(entities.ids) < LEGEND)
-    return rrb.Horizontal(plot, document, name="Run")
+    legend = len(entities.ids) < LEGEND
+    plots = [_plot("Steps per second", [f"{RATES}/**"], legend=legend)]
+    if entities.spec.tick:
+        plots.append(_plot("Neighbours that a node went on without", [f"{GAPS}/**"], legend=legend))
+    return rrb.Horizontal(rrb.Vertical(*plots), document, name="Run")
 
 
 def _plot(name: str, contents: list[str], *, legend: bool, axis: rrb.TimeAxis | None = None) -> rrb.View:

@@ -16,9 +16,11 @@ ERROR_ROWS = 2_000_000  # error norms in a recording, all nodes together (about 
 STATE_VALUES = 4_000_000  # values of states, estimates and reconstructions (about 25 bytes each)
 SERIES = 640  # lines of states, estimates and reconstructions
 
-EVENTS, DESCRIPTION, RATES = "/events", "/description", "/rates"
+EVENTS, DESCRIPTION, RATES, GAPS = "/events", "/description", "/rates", "/missing"
 STATES = {"up": 0x3FB950FF, "unknown": 0x8B949EFF, "late": 0xD29922FF, "down": 0xF85149FF}
 """How a process or an edge can be, the better before the worse, and its colour (RGBA): green, grey, amber, red."""
+FLAGS = {"trusted": 0x3FB950FF, "flagged": 0xD29922FF, "no estimate": 0x30363DFF}
+"""How a node takes its own estimate where messages can be missing, and its colour: green, amber, nearly black."""
 TRUTH = 0x9AA0A6FF
 
 WATCHED = ("residual", "disagreement")
@@ -63,6 +65,14 @@ class Entities:
         """How a process is: ``who`` is its name, plant or node-3."""
         return f"/alive/{self._process(who)}"
 
+    def flag(self, i: int) -> str:
+        """Whether the node marks its estimate."""
+        return f"/flag/{self.name(i)}"
+
+    def gap(self, i: int) -> str:
+        """How many neighbours the node went on without."""
+        return f"{GAPS}/{self.name(i)}"
+
     def rate(self, who: str) -> str:
         """Steps per second of a process."""
         return f"{RATES}/{self._process(who)}"
@@ -95,7 +105,7 @@ class Entities:
     @cached_property
     def shown(self) -> tuple[int, ...]:
         """The states that are recorded: all, or evenly chosen ones where there would be too many lines."""
-        extra = sum(size - self.spec.n for size in self.spec.sizes.values())
+        extra = sum(size - self.spec.n - self.spec.flags for size in self.spec.sizes.values())
         room = max(1, (SERIES - extra) // (len(self.ids) + 1))
         return spread(range(self.spec.n), room)
 
@@ -105,10 +115,10 @@ class Entities:
         return tuple((c, f"{self.state(c)}/actual") for c in self.shown)  # sorts before node_: drawn below
 
     def estimates(self, i: int) -> tuple[Column, ...]:
-        """Columns of node i's estimate row: states, then unknown inputs, then its own noise."""
+        """Columns of node i's estimate row: states, then unknown inputs, then its own noise; not the flag."""
         n, q = self.spec.n, self.spec.unknown_inputs
         columns = [(c, f"{self.state(c)}/{self.name(i)}") for c in self.shown]
-        for c in range(n, self.spec.sizes[i]):
+        for c in range(n, self.spec.sizes[i] - self.spec.flags):
             j = c - n
             path = f"/unknown_input/w{j + 1}/{self.name(i)}" if j < q else f"/noise/{self.name(i)}/v{j - q + 1}"
             columns.append((c, path))

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from duio_mesh.arrays import Array
 from duio_mesh.report.entities import palette, spread
@@ -18,6 +19,7 @@ AXES = 12  # nodes or states that one figure shows
 LINES = 16  # lines in one axes
 POINTS = 4000  # of one line; more are thinned to the least and the greatest of every stretch
 DPI = 120
+SHADE = "#d29922"  # of flagged steps
 
 
 def figures(folder: Path, scenario: Scenario, trace: Trace) -> list[Path]:
@@ -25,12 +27,14 @@ def figures(folder: Path, scenario: Scenario, trace: Trace) -> list[Path]:
 
     errors.png (every node's error, one line per state), error_norms.png (log scale, all nodes), states.png,
     estimates.png (every state with all nodes' estimates), and, where the method reconstructs them,
-    unknown_inputs.png and noise.png. Raises OSError when a file cannot be written.
+    unknown_inputs.png and noise.png. Steps whose estimates the node flags are shaded in a node's own axes, and where
+    nodes share one their lines have a broad shade there. Raises OSError when a file cannot be written.
     """
     drawing = _Drawing(folder, scenario, trace)
-    drawing.errors()
-    drawing.error_norms()
-    drawing.states()
+    if drawing.known:
+        drawing.errors()
+        drawing.error_norms()
+        drawing.states()
     drawing.estimates()
     if trace.what is not None:
         drawing.unknown_inputs(trace.what)
@@ -44,6 +48,7 @@ class _Drawing:
         self._folder, self._name, self._trace = folder, scenario.name, trace
         self._ids = trace.node_ids.tolist()
         self._colours = {i: _hex(c) for i, c in zip(self._ids, palette(len(self._ids)), strict=True)}
+        self.known = not len(trace.x) or not np.isnan(trace.x).all()  # whether somebody knew the true state
         self._hours = bool(len(trace.t)) and float(trace.t[-1]) >= 7200
         self._time = trace.t / 3600 if self._hours else trace.t
         self.written: list[Path] = []
@@ -57,6 +62,7 @@ class _Drawing:
             error = self._trace.xhat[self._ids.index(i)] - self._trace.x
             for c in states:
                 self._line(axes, error[:, c], label=f"$x_{{{c + 1}}}$", lw=0.9)
+            self._shade(axes, i)
             axes.set(title=f"node {i}", ylabel=rf"$\hat x_{{{i}}} - x$")
             axes.axhline(0, color="0.6", lw=0.6, zorder=0)
 
@@ -69,7 +75,7 @@ class _Drawing:
             for at, i in enumerate(self._ids):
                 with np.errstate(over="ignore", invalid="ignore"):
                     norms = log_norms(self._trace.xhat[at] - self._trace.x)
-                self._line(axes, norms, color=self._colours[i], label=f"node {i}", lw=1.1)
+                self._own_line(axes, i, norms, lw=1.1)
             axes.set(ylabel=r"$\log_{10} \|\hat x_i - x\|_2$")
 
         self._grid("error_norms.png", "Estimation error norms", [0], draw)
@@ -91,13 +97,15 @@ class _Drawing:
         nodes = spread(self._ids, LINES)
 
         def draw(axes: Any, c: int) -> None:
-            self._line(axes, self._trace.x[:, c], color="0.65", lw=3, label="truth")
+            if self.known:
+                self._line(axes, self._trace.x[:, c], color="0.65", lw=3, label="truth")
             for i in nodes:
                 own = self._trace.xhat[self._ids.index(i), :, c]
-                self._line(axes, own, color=self._colours[i], lw=0.9, label=f"node {i}")
+                self._own_line(axes, i, own)
             axes.set(title=f"$x_{{{c + 1}}}$")
 
-        self._grid("estimates.png", "States and their estimates", spread(range(self._trace.x.shape[1]), AXES), draw)
+        title = "States and their estimates" if self.known else "Estimates"
+        self._grid("estimates.png", title, spread(range(self._trace.x.shape[1]), AXES), draw)
 
     def unknown_inputs(self, what: Array) -> None:
         """One axes per unknown input, one line per node."""
@@ -105,7 +113,7 @@ class _Drawing:
         def draw(axes: Any, j: int) -> None:
             for i in spread(self._ids, LINES):
                 own = what[self._ids.index(i), :, j]
-                self._line(axes, own, color=self._colours[i], lw=0.9, label=f"node {i}")
+                self._own_line(axes, i, own)
             axes.set(title=f"$w_{{{j + 1}}}$")
 
         self._grid("unknown_inputs.png", "Reconstructed unknown inputs", spread(range(what.shape[2]), AXES), draw)
@@ -116,6 +124,7 @@ class _Drawing:
         def draw(axes: Any, i: int) -> None:
             for j in spread(range(self._trace.vhat[i].shape[1]), LINES):
                 self._line(axes, self._trace.vhat[i][:, j], lw=0.9, label=f"$v_{{{j + 1}}}$")
+            self._shade(axes, i)
             axes.set(title=f"node {i}", ylabel=rf"$\hat v_{{{i}}}$")
 
         self._grid("noise.png", "Reconstructed measurement noise", spread(sorted(self._trace.vhat), AXES), draw)
@@ -141,19 +150,52 @@ class _Drawing:
             lowest = grid[(len(items) - 1 - column) // columns, column]
             lowest.set_xlabel("t [h]" if self._hours else "t [s]")
             lowest.tick_params(labelbottom=True)
-        handles, labels = grid.flat[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside right upper", frameon=False)
+        shown = [axes.get_legend_handles_labels() for axes in grid.flat]
+        named = dict(zip(shown[0][1], shown[0][0], strict=True))  # one entry of each name
+        named.pop("flagged", None)
+        shaded = [dict(zip(names, handles, strict=True)) for handles, names in shown if "flagged" in names]
+        named |= {"flagged": shaded[0]["flagged"]} if shaded else {}
+        figure.legend(named.values(), named.keys(), loc="outside right upper", frameon=False)
         figure.suptitle(f"{title}: {self._name}")
         path = self._folder / file
         figure.savefig(path, dpi=DPI)
         self.written.append(path)
 
+    def _flags(self, i: int) -> NDArray[np.bool_]:
+        """(K,) where node i's flags are to be drawn: up to the step after, and at least as wide as a line's points."""
+        flagged, K = self._trace.flagged, len(self._time)
+        if flagged is None or not K:
+            return np.zeros(K, dtype=bool)
+        own = flagged[self._ids.index(i)].copy()
+        own[1:] |= own[:-1]
+        stride = _stride(K)
+        return np.repeat(np.logical_or.reduceat(own, np.arange(0, K, stride)), stride)[:K]
+
+    def _shade(self, axes: Any, i: int) -> None:
+        """The spans of steps that node i flags, behind the lines of its own axes."""
+        if (flags := self._flags(i)).any():
+            whole = axes.get_xaxis_transform()
+            style = {"color": SHADE, "alpha": 0.25, "lw": 0, "label": "flagged", "zorder": 0}
+            axes.fill_between(self._time, 0, 1, where=flags, transform=whole, **style)
+
+    def _own_line(self, axes: Any, i: int, values: Array, lw: float = 0.9) -> None:
+        """Node i's line among those of others, with a broad shade of it where it flags its estimates."""
+        if (flags := self._flags(i)).any():
+            alone = np.where(flags, values, np.nan)
+            self._line(axes, alone, color=self._colours[i], lw=6, alpha=0.3, label="flagged", solid_capstyle="butt")
+        self._line(axes, values, color=self._colours[i], lw=lw, label=f"node {i}")
+
     def _line(self, axes: Any, values: Array, **style: Any) -> None:
         """A line that keeps its spikes however long it is."""
-        thinned = Decimator(-(-2 * len(values) // POINTS))
+        thinned = Decimator(_stride(len(values)))
         parts = (thinned.push(np.arange(len(values)), values), thinned.drain())
         steps, kept = (np.concatenate(column) for column in zip(*parts, strict=True))
         axes.plot(self._time[steps], kept, **style)
+
+
+def _stride(steps: int) -> int:
+    """Steps of which a line keeps two points."""
+    return max(1, -(-2 * steps // POINTS))
 
 
 def _distinct(axes: Any, lines: int) -> None:

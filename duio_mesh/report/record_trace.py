@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from duio_mesh.report.pairing import runs
 from duio_mesh.report.recording import Recording
 from duio_mesh.scenario.model import Scenario
 from duio_mesh.spec import RecorderSpec
@@ -22,6 +23,7 @@ def record_trace(path: Path, scenario: Scenario, trace: Trace, description: str 
     rows = {}
     for at, i in enumerate(trace.node_ids.tolist()):
         parts = [trace.xhat[at], trace.what[at] if trace.what is not None else None, trace.vhat.get(i)]
+        parts += [trace.flagged[at, :, None]] if trace.flagged is not None else []
         rows[i] = np.hstack([part for part in parts if part is not None])
     temporary = path.with_name(f".{path.name}-{os.getpid()}")
     spec = RecorderSpec(
@@ -37,7 +39,9 @@ def record_trace(path: Path, scenario: Scenario, trace: Trace, description: str 
         truth="",
         estimates={},
         unknown_inputs=q,
+        flags=trace.flagged is not None,
         watch_step=getattr(scenario.options, "watch_step", None),
+        outside=scenario.outside is not None,
     )
     try:
         with Recording(spec, rates=False) as recording:
@@ -51,10 +55,11 @@ def record_trace(path: Path, scenario: Scenario, trace: Trace, description: str 
 
 
 def _outline(recording: Recording, trace: Trace) -> None:
-    """Who wrote rows from the first step on, and who stopped before the last."""
+    """Who wrote rows from the first step on, who stopped before the last, and who came back."""
     written = {"plant": trace.x} | {f"node-{i}": trace.xhat[at] for at, i in enumerate(trace.node_ids.tolist())}
+    changes = [(0, who, "up") for who in written]
     for who, rows in written.items():
-        lost = np.flatnonzero(np.isnan(rows).all(axis=1))
-        recording.liveness(who, "up", 0)
-        if len(lost):
-            recording.liveness(who, "down", int(lost[0]))
+        for first, after in runs(np.flatnonzero(np.isnan(rows).all(axis=1))):
+            changes += [(first, who, "down")] + ([(after, who, "up")] if after < len(rows) else [])
+    for k, who, state in sorted(changes, key=lambda change: change[0]):  # an edge is as its ends are at that time
+        recording.liveness(who, state, k)

@@ -16,11 +16,14 @@ from duio_mesh.report import blueprint as look
 from duio_mesh.report.buffer import ROWS, Buffer
 from duio_mesh.report.conditions import Conditions
 from duio_mesh.report.entities import EVENTS, WATCHED, Column, Entities
-from duio_mesh.report.pairing import Decimator, Errors, Pairing, Span, Spans, log_norms, runs
+from duio_mesh.report.flags import Flags
+from duio_mesh.report.gaps import Gaps
+from duio_mesh.report.pairing import Decimator, Errors, Middle, Pairing, Span, Spans, log_norms, runs
 from duio_mesh.report.streams import Batch, FileStream, LiveStream, Opening
 from duio_mesh.spec import RecorderSpec
 
-SENDS = 100  # of one series in a whole run: a viewer is behind by one percent of the plot's width at most
+SENDS = 20  # of one series in a whole run: each leaves some kB with Rerun until the file is closed ...
+LIVE_SENDS = 100  # ... where somebody may watch: a viewer is behind by one percent of the plot's width at most
 CHUNKS = 8_000  # sends of a whole run, all series: each costs 50 microseconds and 2 kB whatever is in it
 
 
@@ -45,19 +48,23 @@ class Recording:
         self._live = LiveStream(opening) if spec.live else None
         self._closed, self._watched = False, set[int]()
 
-        self._pairing = Pairing(spec.n, entities.ids, spec.steps)
+        self._middle = Middle(spec.n, entities.ids, spec.steps) if spec.outside else None
+        self._pairing = self._middle or Pairing(spec.n, entities.ids, spec.steps)
         self._seen: dict[int | None, Spans] = {source: Spans() for source in (None, *entities.ids)}
         self._thinned = {i: Decimator(entities.error_stride) for i in entities.ids}
         self._columns: dict[int | None, tuple[Column, ...]] = {None: entities.truth}
         self._columns |= {i: entities.estimates(i) for i in entities.ids}
         paths = {source: [path for _, path in columns] for source, columns in self._columns.items()}
-        enough = _enough(entities.error_rows, len(entities.ids), CHUNKS // 4)
+        most = LIVE_SENDS if spec.live else SENDS
+        enough = _enough(entities.error_rows, len(entities.ids), CHUNKS // 4, most)
         self._errors = {i: Buffer([entities.error(i)], enough, self._scalars) for i in entities.ids}
-        enough = _enough(entities.state_values, entities.series, CHUNKS * 3 // 4)
+        enough = _enough(entities.state_values, entities.series, CHUNKS * 3 // 4, most)
         self._states = {source: Buffer(paths[source], enough, self._scalars) for source in paths}
 
         self.event(f"{len(entities.ids)} nodes, {spec.n} states, {spec.steps} steps of {spec.step:g} s")
         self._conditions = Conditions(entities, self._send, self.event, self._reached)
+        self._gaps = Gaps(entities, self._scalars) if spec.tick else None
+        self._flags = Flags(entities, self._send) if spec.flags else None
 
     @property
     def url(self) -> str | None:
@@ -77,14 +84,19 @@ class Recording:
             self._say(errors)
 
     def estimates(self, node: int, k: int, rows: Array) -> None:
-        """Rows (m, size) of a node for the steps k .. k+m-1: n states, then what else the method estimates.
+        """Rows (m, size) of a node for the steps k .. k+m-1: n states, then what else the method estimates,
+        and where the spec says so its own mark of the estimate (not 0: flagged).
 
         Raises ValueError for a wrong shape or step, KeyError for an unknown node.
         """
         self._check(f"node {node}", k, rows, self._spec.sizes[node])
         self._record(node, k, rows)
         for first, last in self._pairing.known[node].gaps(k, k + len(rows)):
-            self._say(self._pairing.estimates(node, first, rows[first - k : last - k, : self._spec.n]))
+            part = rows[first - k : last - k, : self._spec.n]
+            for errors in self._middle.together(node, first, part) if self._middle else ():
+                self._say(errors)
+            if not self._middle:
+                self._say(self._pairing.estimates(node, first, part))
 
     def rounds(self, node: int, rows: Array) -> None:
         """Rows (m, 3) [round, residual, disagreement] of the step ``spec.watch_step``; a node's first ones count.
@@ -123,6 +135,11 @@ class Recording:
         for who, value in values.items():
             self._send(self._entities.rate(who), [k], rr.Scalars.columns(scalars=[float(value)]))
 
+    def missing_neighbours(self, node: int, k: int, counts: Array) -> None:
+        """How many neighbours a node went on without in the steps from k on (m,), in a run on the wall clock."""
+        if self._gaps:
+            self._gaps.rows(node, k, counts)
+
     def flush(self) -> None:
         """Write what has gathered, where it is enough to be worth it. Call it as often as a viewer should see news.
 
@@ -133,10 +150,15 @@ class Recording:
             buffer.flush()
         self._file.flush()
 
-    def missing(self) -> dict[int | None, list[Span]]:
-        """Steps (first, last + 1) whose rows or errors are not in the recording, by node; None is the truth."""
-        steps = self._spec.steps
+    def missing(self, steps: int | None = None) -> dict[int | None, list[Span]]:
+        """Steps (first, last + 1) whose rows or errors are not in the recording, by node; None is the truth.
+
+        Of the first ``steps`` steps, by default of all. A truth that nobody knows is not missing.
+        """
+        steps = self._spec.steps if steps is None else steps
         found = {None: self._seen[None].gaps(0, steps)} | {i: s.gaps(0, steps) for i, s in self._pairing.known.items()}
+        if self._spec.outside:
+            del found[None]
         return {source: gaps for source, gaps in found.items() if gaps}
 
     def fill(self, truth: Array, estimates: Mapping[int, Array]) -> None:
@@ -163,9 +185,12 @@ class Recording:
         self._conditions.settle(final=True)
         for i, decimator in self._thinned.items():
             self._errors[i].add(*_column(*decimator.drain()))
-        missing = self.missing()
+        steps = self._spec.steps
+        if self._spec.outside:  # who feeds the run may end it early
+            steps = max(self._reached(f"node-{i}") for i in self._entities.ids)
+        missing = self.missing(steps)
         if not missing:
-            self.event("complete: every step of every node is here", "INFO", self._spec.steps - 1)
+            self.event("complete: every step of every node is here", "INFO", max(0, steps - 1))
         for source, gaps in missing.items():
             who = "the truth" if source is None else f"node {source}"
             spans = ", ".join(f"{a} to {b - 1}" for a, b in gaps[:8]) + (", ..." if len(gaps) > 8 else "")
@@ -199,7 +224,10 @@ class Recording:
         for first, last in self._seen[source].gaps(k, k + len(rows)):
             steps = np.arange(first, last)
             keep = (steps % stride == 0) | (steps == final)
-            self._states[source].add(steps[keep], rows[first - k : last - k][keep][:, [c for c, _ in columns]])
+            new = rows[first - k : last - k]
+            self._states[source].add(steps[keep], new[keep][:, [c for c, _ in columns]])
+            if self._flags and source is not None:
+                self._flags.rows(source, first, new[:, -1])
         self._seen[source].add(k, k + len(rows))
 
     def _say(self, errors: Errors) -> None:
@@ -212,7 +240,10 @@ class Recording:
         return max((last for _, last in seen), default=0)
 
     def _break_lines(self) -> None:
-        """A NaN at the start of every gap between two rows: a viewer would join the rows with a line."""
+        """A NaN at the start of every gap between two rows: a viewer would join the rows with a line. Lanes end too."""
+        if self._flags:
+            for i in self._entities.ids:
+                self._flags.gaps(i, [first for first, _ in self._seen[i].gaps(0, self._spec.steps)])
         for i, known in self._pairing.known.items():
             at = _inner_gaps(known)
             self._errors[i].add(at, np.full((len(at), 1), np.nan))
@@ -230,7 +261,7 @@ class Recording:
                 self.estimates(source, k + first, part)
 
     def _buffers(self) -> list[Buffer]:
-        return [*self._errors.values(), *self._states.values()]
+        return [*self._errors.values(), *self._states.values(), *(self._gaps.buffers.values() if self._gaps else ())]
 
     def _scalars(self, path: str, steps: NDArray[np.int64], values: Array) -> None:
         self._send(path, steps, rr.Scalars.columns(scalars=values))
@@ -248,9 +279,9 @@ class Recording:
             self._live.send(batch)
 
 
-def _enough(values: int, series: int, sends: int) -> int:
-    """Rows that one send of a series should hold: all series together are to take so many sends for their values."""
-    return min(ROWS, max(1, values // series // max(1, min(SENDS, sends // series))))
+def _enough(values: int, series: int, sends: int, most: int) -> int:
+    """Rows that one send of a series should hold: all series are to take so many sends for their values, one ``most``."""
+    return min(ROWS, max(1, values // series // max(1, min(most, sends // series))))
 
 
 def _column(steps: NDArray[np.int64], values: Array) -> tuple[NDArray[np.int64], Array]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from duio_mesh.trace import Trace
 
-_VHAT = "vhat_"
+_VHAT, _SAMPLE = "vhat_", "sample_"
 
 
 def write_trace(path: Path, trace: Trace) -> None:
@@ -45,12 +45,19 @@ def read_trace(path: Path) -> Trace:
             node_ids=named.pop("node_ids"),
             xhat=named.pop("xhat"),
             what=named.pop("what", None),
-            vhat={int(name.removeprefix(_VHAT)): named.pop(name) for name in list(named) if name.startswith(_VHAT)},
+            flagged=named.pop("flagged", None),
+            vhat=_by_node(named, _VHAT),
+            samples=_by_node(named, _SAMPLE),
         )
     except (KeyError, ValueError, TypeError, AttributeError, EOFError, zipfile.BadZipFile) as e:
         raise ValueError(f"{path} is not a trace: {e}") from None
     _check(path, trace, sorted(named))
     return trace
+
+
+def _by_node(named: dict[str, Any], prefix: str) -> dict[int, Any]:
+    """Take the arrays out that have this prefix, by the node's id behind it."""
+    return {int(name.removeprefix(prefix)): named.pop(name) for name in list(named) if name.startswith(prefix)}
 
 
 def _check(path: Path, trace: Trace, unknown: list[str]) -> None:
@@ -65,7 +72,9 @@ def _check(path: Path, trace: Trace, unknown: list[str]) -> None:
             ("t", trace.t, trace.t.shape == (K,)),
             ("xhat", trace.xhat, trace.xhat.shape == (N, K, n)),
             ("what", trace.what, trace.what is None or trace.what.shape[:2] == (N, K)),
+            ("flagged", trace.flagged, trace.flagged is None or trace.flagged.shape == (N, K)),
             *((f"{_VHAT}{i}", v, v.shape[:1] == (K,) and i in trace.node_ids) for i, v in trace.vhat.items()),
+            *((f"{_SAMPLE}{i}", s, s.shape[:1] == (K,) and i in trace.node_ids) for i, s in trace.samples.items()),
         )
         if not fits and array is not None
     ]

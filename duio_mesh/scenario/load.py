@@ -12,11 +12,14 @@ from pydantic import BaseModel
 from duio_mesh.methods import METHODS
 from duio_mesh.scenario import model, schema
 from duio_mesh.scenario.disturbed import read_faults
+from duio_mesh.scenario.external import read_external, resolve_model
+from duio_mesh.scenario.hosts import read_hosts
 from duio_mesh.scenario.network import read_graph, read_nodes
 from duio_mesh.scenario.overrides import apply_override
 from duio_mesh.scenario.plant import PLANT, PlantParts, read_plant
 from duio_mesh.scenario.problems import Problems, did_you_mean, listed
 from duio_mesh.scenario.source import read_file
+from duio_mesh.scenario.timing import read_timing
 from duio_mesh.scenario.validate import describe, fields, whole
 
 OptionsOf = Callable[[str], type[BaseModel]]
@@ -47,6 +50,7 @@ def load_scenario(path: str | FilePath, overrides: Iterable[str] = (), *, option
 
 def _resolve_plant(document: dict[str, Any], folder: FilePath, problems: Problems) -> None:
     """Replace the name of a plant file by what the file holds."""
+    resolve_model(document, folder, problems)
     name = document.get("plant")
     if isinstance(name, str):
         place = problems.place(PLANT)
@@ -69,6 +73,9 @@ def _scenario(document: dict[str, Any], problems: Problems, options_of: OptionsO
     settings = _run(run, len(nodes or ()) * (parts.states.number if parts.states else 0), problems)
     faults = read_faults(document.get("faults"), graph, run, problems)
     security = _security(document, problems)
+    hosts = read_hosts(document, nodes, security, problems)
+    timing = read_timing(document, parts.plant, run, problems)
+    outside = read_external(document, nodes, problems)
     if problems or parts.plant is None or nodes is None or graph is None or settings is None:
         return None
     resolved = copy.deepcopy(document)
@@ -86,6 +93,9 @@ def _scenario(document: dict[str, Any], problems: Problems, options_of: OptionsO
         resolved,
         faults,
         security,
+        timing,
+        outside,
+        hosts=hosts,
     )
 
 

@@ -7,12 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
 from duio_mesh.arrays import Array
 from duio_mesh.faults import NO_FAULTS, Faults
+from duio_mesh.spec import Outside
 
 Signal: TypeAlias = tuple[Mapping[str, Mapping[str, float]], ...]
 """A sum of terms, each ``{kind: parameters}``; ``duio_mesh.dynamics.signal`` evaluates it. () is zero."""
@@ -155,6 +157,18 @@ class Run:
     on_node_loss: Literal["stop", "degrade", "restart"] = "stop"
     rejoin: Literal["warm", "cold"] = "warm"  # how a node that was replaced starts
     max_seconds: float | None = None  # wall clock, from the start of the processes
+    inputs: bool = False  # every node keeps a tape of what its observer is given
+
+
+class Timing(NamedTuple):
+    """When steps happen."""
+
+    mode: Literal["lockstep", "realtime"] = "lockstep"
+    tick: float = 0.0  # wall seconds per step; 0: as long as it takes
+    wait: float = 0.0  # seconds from a sample's arrival in which a node waits for its neighbours
+
+
+LOCKSTEP = Timing()
 
 
 class Security(NamedTuple):
@@ -166,6 +180,26 @@ class Security(NamedTuple):
 
 
 OPEN = Security()
+
+
+class Host(NamedTuple):
+    """One machine of a run over several."""
+
+    address: str  # under which the others reach it
+    listen: str  # IP address to listen on
+    port: int  # the first one
+    runs: tuple[str, ...]  # names of processes
+    via: str  # routed: the host whose router this one's router dials; "" for the first
+
+
+class Hosts(NamedTuple):
+    """Who runs where (docs/deploy.md)."""
+
+    by_name: Mapping[str, Host] = MappingProxyType({})  # in the order of the file
+    routed: bool = False  # processes talk through one router per host
+
+
+NO_HOSTS = Hosts()
 
 
 @dataclass(frozen=True)
@@ -183,11 +217,14 @@ class Scenario:
     document: Mapping[str, Any] = field(repr=False)  # the resolved file as plain data: what scenario.yaml is made of
     faults: Faults = NO_FAULTS
     security: Security = OPEN
+    timing: Timing = LOCKSTEP
+    outside: Outside | None = None  # the measurements come from outside: nobody knows the true state
+    hosts: Hosts = NO_HOSTS
 
     @property
     def patchy(self) -> bool:
         """Whether messages can be missing, so that observers need to know what to do without them."""
-        return bool(self.faults.links) or self.run.on_node_loss != "stop"
+        return bool(self.faults.links) or self.timing.mode == "realtime" or self.run.on_node_loss != "stop"
 
     def known(self, i: int) -> Array:
         """B_i (n, m_i): columns of B whose inputs node i is told, in the order of ``plant.inputs``."""

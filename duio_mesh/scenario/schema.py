@@ -15,7 +15,7 @@ from duio_mesh.faults import MAX_DELAY
 from duio_mesh.scenario.problems import listed
 from duio_mesh.scenario.strict import Strict
 
-RESERVED = dict.fromkeys(("timing", "hosts"), "is reserved for a later version of duio_mesh")
+RESERVED: dict[str, str] = {}
 """Top-level keys that no version accepts yet; to accept one, give it a field in Topology and delete it here."""
 
 MAX_STATES = 2000
@@ -184,6 +184,40 @@ class Node(Strict):
     C: Annotated[Matrix, Field(min_length=1, max_length=MAX_STATES)]
     knows: Annotated[list[str], Field(description="names of the inputs that this node is told", default_factory=list)]
     noise: Noise | float | None = None
+    keys: Annotated[
+        str | Annotated[list[Name], Field(min_length=1)] | None,
+        Field(description="external: one key for [y; u], or one for each of its numbers; default: external.key"),
+    ] = None
+
+
+Encoding: TypeAlias = Literal[
+    "json", "float64", "std_msgs/Float64", "std_msgs/Float64MultiArray", "sensor_msgs/Temperature"
+]
+
+
+class External(Strict):
+    """Where the measurements come from when the plant is not simulated."""
+
+    model: Annotated[str | None, Field(description="plant file, with plant: external")] = None
+    key: Annotated[str | None, Field(description="Zenoh key of a node's [y; u]; {node} is its id")] = None
+    encoding: Encoding = "json"
+    listen: Annotated[str | None, Field(description="where publishers connect; default tcp/127.0.0.1:7447")] = None
+    connect: Annotated[str | None, Field(description="a Zenoh router to go to, instead of listening")] = None
+    exposed: Annotated[bool, Field(description="whoever reaches the port may publish measurements")] = False
+    end: Annotated[str | None, Field(description="key on which a publisher says that it is over")] = None
+    hold: Annotated[
+        float | None,
+        Field(gt=0, le=86_400, description="seconds after a step's first sample; then late sensors keep their values"),
+    ] = None
+    start_within: Annotated[
+        float, Field(gt=0, le=86_400, description="seconds in which every sensor must have spoken")
+    ] = 60.0
+
+    @model_validator(mode="after")
+    def _one_way(self) -> External:
+        if self.listen is not None and self.connect is not None:
+            raise _misfit("give either listen or connect, not both", at="connect")
+        return self
 
 
 Link: TypeAlias = Annotated[list[float], Field(min_length=2, max_length=3)]
@@ -228,6 +262,7 @@ class Run(Strict):
     max_seconds: Annotated[
         float | None, Field(gt=0, le=31_536_000, description="a run that takes longer fails; default: no limit")
     ] = None
+    inputs: Annotated[bool, Field(description="every node keeps a tape of its inputs, to be replayed alone")] = False
 
 
 class GilbertElliott(Strict):
@@ -353,10 +388,65 @@ class Security(Strict):
         return self
 
 
+LEAST_TICK, MOST_TICK = 0.001, 3600.0  # seconds
+
+Pace: TypeAlias = Literal["lockstep", "realtime"]
+
+
+class Timing(Strict):
+    """When steps happen."""
+
+    mode: Pace
+    tick: Annotated[
+        float | None,
+        Field(ge=LEAST_TICK, le=MOST_TICK, description="wall seconds per step; default: the plant's own"),
+    ] = None
+    wait: Annotated[
+        float | None,
+        Field(gt=0, le=0.9, description="part of a tick in which a node waits for its neighbours; default 0.5"),
+    ] = None
+
+    @model_validator(mode="after")
+    def _belongs_to_realtime(self) -> Timing:
+        for name in ("tick", "wait"):
+            if self.mode == "lockstep" and getattr(self, name) is not None:
+                raise _misfit("belongs to realtime; in lockstep a step takes as long as it takes", at=name)
+        return self
+
+
+class Timed(Strict):
+    """Everything by its mode alone, or a mapping."""
+
+    timing: Annotated[Pace | Timing, Field(description="lockstep, or on the wall clock")] = "lockstep"
+
+
 class Protected(Strict):
     """Everything by its mode alone, or a mapping."""
 
     security: Annotated[Mode | Security, Field(description="who may speak")] = "open"
+
+
+class Host(Strict):
+    """One machine, and who runs there."""
+
+    address: Annotated[Name, Field(description="IP address or name under which the other hosts reach this one")]
+    runs: Annotated[
+        list[int | Literal["plant", "recorder"]], Field(min_length=1, description="nodes by number; plant; recorder")
+    ]
+    port: Annotated[int, Field(ge=1, le=65_535, description="the first; one per process, or the router's alone")] = 7447
+    listen: Annotated[Name | None, Field(description="IP address to listen on; default: the address")] = None
+    via: Annotated[
+        Name | None, Field(description="routed: an earlier host, whose router this one's dials; default: the first")
+    ] = None
+
+
+class Placed(Strict):
+    """For several hosts."""
+
+    hosts: Annotated[dict[str, Host] | None, Field(description="for export: who runs where")] = None
+    transport: Annotated[
+        Literal["direct", "routed"], Field(description="routed: through one Zenoh router per host")
+    ] = "direct"
 
 
 class Heading(Strict):
@@ -366,7 +456,7 @@ class Heading(Strict):
     description: Annotated[str, Field(max_length=10_000)] = ""
 
 
-class Topology(Heading, Protected):
+class Topology(Heading, Protected, Timed, Placed):
     """A whole topology file. ``observer`` holds ``method`` and that method's own options."""
 
     plant: str | Plant
@@ -375,3 +465,4 @@ class Topology(Heading, Protected):
     graph: Graph
     run: Run
     faults: Faults | None = None
+    external: External | None = None

@@ -11,6 +11,7 @@ from duio_mesh.observers.base import can_batch
 from duio_mesh.scenario.model import Scenario
 from duio_mesh.synthesis.design import Design
 from duio_mesh.synthesis.recovery import with_recovery
+from duio_mesh.synthesis.timing import on_the_clock
 
 __all__ = ["Design", "options_of", "synthesise"]
 
@@ -34,4 +35,6 @@ def synthesise(scenario: Scenario, progress: Callable[[str], None] = lambda _: N
             "steps at once; remove run.batch, or use a method without memory between its fusions (admm)"
         )
     design: Design = importlib.import_module(f"duio_mesh.synthesis.{scenario.method}").design(scenario, progress)
-    return design if scenario.run.on_node_loss == "stop" else with_recovery(design, progress)
+    if scenario.run.on_node_loss != "stop":
+        design = with_recovery(design, progress)
+    return on_the_clock(design)

@@ -10,8 +10,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import numpy as np
+
 from duio_mesh.arrays import Array
-from duio_mesh.geometry.subspace import norm
 from duio_mesh.synthesis.eigenvalue import Say, minimise_largest_eigenvalue
 from duio_mesh.synthesis.pencil import Criterion, Pencil
 
@@ -30,7 +31,12 @@ class Coupling(NamedTuple):
     beta: float  # V(k+1) - V(k) <= beta V(k)
     lower: float  # no g has a smaller beta in the same criterion
     norm: float  # ||Phi_u||_2
-    phi: Array  # (N, N), Phi_u
+    pencil: Pencil  # criterion norm
+
+    @property
+    def phi(self) -> Array:
+        """(N, N), Phi_u."""
+        return self.pencil.phi(self.g)
 
 
 def couple(
@@ -38,21 +44,25 @@ def couple(
 ) -> Coupling:
     """The g that minimises beta_u for these nodes and the rows and columns (m, m) of their Laplacian.
 
-    ``paper``: (38)-(39) literally. Its Schur complement with gamma = 1 + beta is
+    ``paper``: (38)-(39) literally. Its Schur complement with t = 1 + beta is
 
-        A_u'A_u - A_u'Theta - Theta'A_u + Theta'Theta / gamma <= gamma I,
+        A_u'A_u - A_u'Theta - Theta'A_u + Theta'Theta / t <= t I,
 
-    while (49) has Theta'Theta without 1/gamma: (39) is conservative for beta < 0.
+    while (49) has Theta'Theta without 1 / t: (39) is conservative for beta < 0.
     ``norm``: (49) exactly, beta = ||A_u - Theta(g)||_2^2 - 1.
     (40), beta_u <= 0, is not imposed: the caller tests the sign, which also says by how much it fails.
     Without any undetectable part Phi_u is empty, its norm 0 and beta = -1. Raises DesignError as the solver does.
     """
-    pencil = Pencil([part.A for part in parts], [part.U for part in parts], laplacian, criterion)
-    best = minimise_largest_eigenvalue([pencil], say)
-    phi = pencil.phi(best.x)
-    return Coupling(best.x, _beta(best.value, criterion), _beta(best.lower, criterion), norm(phi), phi)
+    best = minimise_largest_eigenvalue([pencil_of(parts, laplacian, criterion)], say)
+    return coupling(best.g, best.value - 1, best.lower - 1, pencil_of(parts, laplacian, "norm"))
 
 
-def _beta(gamma: float, criterion: Criterion) -> float:
-    """beta_u of a value of the pencil: gamma is ||Phi_u||_2 (norm) or 1 + beta_u (paper)."""
-    return max(gamma, 0.0) ** 2 - 1 if criterion == "norm" else gamma - 1
+def coupling(g: Array, beta: float | None, lower: float, pencil: Pencil) -> Coupling:
+    """With the norm of Phi_u computed; ``beta`` None: what that norm gives."""
+    square = pencil.leading(g, min(3, pencil.N), np.ones(pencil.N))[0] if pencil.N else 0.0
+    return Coupling(g, square - 1 if beta is None else beta, lower, float(np.sqrt(square)), pencil)
+
+
+def pencil_of(parts: Sequence[Undetectable], laplacian: Array, criterion: Criterion) -> Pencil:
+    """The matrix of ``couple``."""
+    return Pencil([part.A for part in parts], [part.U for part in parts], laplacian, criterion)

@@ -48,8 +48,9 @@ def node_spec(
         deadline=run.deadline,
         window=flow.window,
         credit=flow.quarter,
-        block=flow.quarter,
+        block=1 if scenario.outside else flow.quarter,  # what comes from outside is passed on at once
         batch=run.batch,
+        outside=scenario.outside is not None,
         faults=scenario.faults.into(i, () if run.on_node_loss == "stop" else scenario.graph.hears(i)),
         spoils=scenario.faults.spoilt_by(i),
         without=scenario.options.without if scenario.patchy else "",
@@ -107,10 +108,11 @@ def plant_spec(scenario: Scenario) -> PlantSpec:
         seed=run.seed,
         steps=run.steps,
         window=flow.window,
-        block=flow.quarter,
+        block=1 if scenario.outside else flow.quarter,
         deadline=run.deadline,
         on_loss=run.on_node_loss,
         returns=scenario.faults.returns(),
+        outside=scenario.outside,
     )
 
 

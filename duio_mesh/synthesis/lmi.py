@@ -25,7 +25,7 @@ from duio_mesh.spec import NodeSpec
 from duio_mesh.synthesis.absence import Absence
 from duio_mesh.synthesis.design import Design, Progress, node_spec, plant_spec
 from duio_mesh.synthesis.lmi_coupling import couple_islands
-from duio_mesh.synthesis.lmi_network import Local, Network, certificate, error_matrix_of
+from duio_mesh.synthesis.lmi_network import Local, Network, certificate, errors_of
 from duio_mesh.synthesis.local_gain import Subsystem, h2_gain, hinf_gain, placed_gain, worst_gain
 from duio_mesh.synthesis.noise import noise_covariance
 from duio_mesh.synthesis.uio import decouple_node
@@ -76,13 +76,13 @@ def design(scenario: Scenario, progress: Progress) -> Design:
     network = couple_islands(scenario, nodes, progress)
     progress("certificate")
     specs = {i: _spec(scenario, i, network) for i in nodes}
-    promises = certificate(scenario, network, error_matrix_of(specs, scenario.graph), specs)
+    promises = certificate(scenario, network, specs, lambda what: progress(f"certificate: {what}"))
     return Design(scenario, plant_spec(scenario), specs, promises)
 
 
 def error_radius(design: Design, graph: Graph) -> float:
     """Spectral radius of (31) of graph.ids with the designed gains on another graph."""
-    return spectral_radius(error_matrix_of(design.nodes, graph))
+    return errors_of(design.nodes, graph).radius()
 
 
 def _local(scenario: Scenario, i: int) -> Local:

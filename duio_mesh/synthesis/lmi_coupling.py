@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 
 from duio_mesh.errors import DesignError
-from duio_mesh.geometry.subspace import norm
 from duio_mesh.scenario.model import Graph, Scenario
-from duio_mesh.synthesis.consensus import Coupling, Undetectable, couple
+from duio_mesh.synthesis.consensus import Coupling, Undetectable, couple, coupling, pencil_of
 from duio_mesh.synthesis.design import Progress
 from duio_mesh.synthesis.eigenvalue import Say, minimise_largest_eigenvalue
 from duio_mesh.synthesis.lmi_network import Local, Network
@@ -46,7 +45,7 @@ def _gains(scenario: Scenario, island: Island, nodes: Mapping[int, Local], say: 
         return _robust(scenario, island, nodes, say)
     found = couple(_parts(island, nodes), laplacian, "paper" if options.consensus == "paper" else "norm", say)
     if options.consensus == "schur":
-        return _schur(island, nodes, laplacian, found, say)
+        return _schur(island, found, say)
     if not found.beta < 0:  # instead of (40): the sign also says by how much
         raise DesignError(_infeasible(island, found, nodes, options))
     return found
@@ -57,8 +56,7 @@ def _parts(island: Island, nodes: Mapping[int, Local]) -> list[Undetectable]:
 
 
 def _pencil(island: Island, nodes: Mapping[int, Local], graph: Graph) -> Pencil:
-    parts = _parts(island, nodes)
-    return Pencil([part.A for part in parts], [part.U for part in parts], _laplacian(graph, island), "norm")
+    return pencil_of(_parts(island, nodes), _laplacian(graph, island), "norm")
 
 
 def _laplacian(graph: Graph, island: Island) -> Any:
@@ -66,20 +64,16 @@ def _laplacian(graph: Graph, island: Island) -> Any:
     return graph.laplacian()[np.ix_(rows, rows)]
 
 
-def _schur(island: Island, nodes: Mapping[int, Local], laplacian: Any, start: Coupling, say: Say) -> Coupling:
+def _schur(island: Island, start: Coupling, say: Say) -> Coupling:
     """A g whose Phi_u is Schur, whatever its norm."""
-    parts = _parts(island, nodes)
-    pencil = Pencil([part.A for part in parts], [part.U for part in parts], laplacian, "norm")
-    g, radius = least_radius(pencil, start.g, say)
+    g, radius = least_radius(start.pencil, start.g, say)
     if not radius < 1 - 1e-9:
         raise DesignError(
             f"consensus: schur found no stabilising gains for {_who(island)}: the least spectral radius of Phi_u found "
             f"is {radius:.6g} (a search, not a proof that none exist). {_advice()}; or use method: augmented, whose "
             "condition is exact."
         )
-    phi = pencil.phi(g)
-    size = norm(phi)
-    return Coupling(g, size**2 - 1, start.lower, size, phi)
+    return coupling(g, None, start.lower, start.pencil)
 
 
 def _robust(scenario: Scenario, island: Island, nodes: Mapping[int, Local], say: Say) -> Coupling:
@@ -96,23 +90,22 @@ def _robust(scenario: Scenario, island: Island, nodes: Mapping[int, Local], say:
         alone = {}
         for name, pencil in pencils.items():
             say(f"{name}, on its own")
-            alone[name] = minimise_largest_eigenvalue([pencil]).lower ** 2 - 1
+            alone[name] = minimise_largest_eigenvalue([pencil]).lower - 1
         hopeless = {name: beta for name, beta in alone.items() if beta >= 0}
         if hopeless:
             cause = "impossible whatever the others ask: " + _listed(hopeless)
         else:
-            size = {name: pencil.value(best.x) ** 2 - 1 for name, pencil in pencils.items()}
+            size = {name: coupling(best.g, None, -1.0, pencil).beta for name, pencil in pencils.items()}
             cause = "each is possible alone, but not together; at the best compromise: " + _listed(
-                {name: beta for name, beta in size.items() if beta >= 0.99 * (best.value**2 - 1)}
+                {name: beta for name, beta in size.items() if beta >= 0.99 * (best.value - 1)}
             )
         raise DesignError(
             f"consensus: robust is infeasible on {_who(island)}: no g makes the sum of |U_i'e_i|^2 fall in every step "
-            f"of the graph and of every graph with one edge lost (least common beta_u = {best.value**2 - 1:+.3g}); "
+            f"of the graph and of every graph with one edge lost (least common beta_u = {best.value - 1:+.3g}); "
             f"{cause}. Add edges, or use consensus: norm and look at --check --contingency 1, which asks for "
             "eigenvalues only."
         )
-    nominal = pencils["nothing lost"].phi(best.x)
-    return Coupling(best.x, best.value**2 - 1, max(best.lower, 0.0) ** 2 - 1, norm(nominal), nominal)
+    return coupling(best.g, best.value - 1, best.lower - 1, pencils["nothing lost"])
 
 
 def _listed(values: Mapping[str, float]) -> str:

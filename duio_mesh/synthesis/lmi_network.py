@@ -18,7 +18,8 @@ from duio_mesh.spec import NodeSpec
 from duio_mesh.synthesis.consensus import Coupling
 from duio_mesh.synthesis.losses import losses, without
 from duio_mesh.synthesis.noise import noise_covariance
-from duio_mesh.synthesis.sampled import Coupled, error_system
+from duio_mesh.synthesis.sampled import Coupled
+from duio_mesh.synthesis.stacked import DENSE, Say, Stacked, largest_modulus
 from duio_mesh.synthesis.uio import Decoupling
 
 
@@ -48,48 +49,76 @@ class Network(NamedTuple):
         return max(island.beta for island in self.islands.values())
 
 
-def error_matrix_of(specs: Mapping[int, NodeSpec], graph: Graph) -> Array:
-    """(n |ids|, n |ids|): e(k+1) = Phi e(k) + ... of graph.ids, (31) in the original coordinates.
+def errors_of(specs: Mapping[int, NodeSpec], graph: Graph) -> Stacked:
+    """e(k+1) = Phi e(k) + ... of graph.ids, (31) in the original coordinates, n |ids| rows.
 
     Block (i, j) is (P_i A - K_i C_i) [i = j] - g_i l_ij U_i U_i', from the N and G that the nodes are given.
     """
     I = np.eye(specs[graph.ids[0]].n)
     blocks = [Coupled(specs[i].matrices["N"], specs[i].matrices["G"], I, I) for i in graph.ids]
-    return error_system(blocks, graph.laplacian())
+    return Stacked(blocks, graph.laplacian())
 
 
-def predicted_rms(scenario: Scenario, network: Network, Phi: Array) -> list[float]:
-    """Stationary RMS error per state of each node under the white noise of the file.
+def predicted_rms(scenario: Scenario, network: Network, errors: Stacked, say: Say) -> list[float | None]:
+    """Stationary RMS error per state of each node under the white noise of the file; None where it takes too long.
 
     (31) is e(k+1) = Phi e(k) + K v(k) - E v(k+1). With s = e + E v the noise enters once, s(k+1) = Phi s(k) +
     (K - Phi E) v(k), and cov e = cov s + E V E', because s(k) does not depend on v(k).
     """
     nodes = network.nodes.values()
-    V = linalg.block_diag(*[noise_covariance(scenario.nodes[i].noise) for i in network.nodes])
-    E = linalg.block_diag(*[own.uio.E for own in nodes])
-    entry = linalg.block_diag(*[own.K for own in nodes]) - Phi @ E
-    cov = linalg.solve_discrete_lyapunov(Phi, entry @ V @ entry.T) + E @ V @ E.T
-    return [float(np.sqrt(part.mean())) for part in np.split(np.diag(cov), len(network.nodes))]
+    root = linalg.block_diag(*[_root(noise_covariance(scenario.nodes[i].noise)) for i in network.nodes])
+    E = linalg.block_diag(*[own.uio.E for own in nodes]) @ root
+    entry = linalg.block_diag(*[own.K for own in nodes]) @ root - errors.times(E)
+    if errors.size <= DENSE:
+        variances = np.diag(linalg.solve_discrete_lyapunov(errors.dense(), entry @ entry.T))
+    else:
+        found = errors.variances(entry, say)
+        if found is None:
+            return [None for _ in nodes]
+        variances = found
+    return [float(np.sqrt(part.mean())) for part in np.split(variances + np.sum(E**2, axis=1), len(network.nodes))]
 
 
-def certificate(scenario: Scenario, network: Network, Phi: Array, specs: Mapping[int, NodeSpec]) -> dict[str, Any]:
-    """Plain data; Phi (31) is that of the scenario's graph.
+def _root(V: Array) -> Array:
+    """R with R R' = V >= 0."""
+    values, vectors = np.linalg.eigh(V)
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0)))
 
+
+def certificate(scenario: Scenario, network: Network, specs: Mapping[int, NodeSpec], say: Say) -> dict[str, Any]:
+    """Plain data about the network on the scenario's graph.
+
+    Up to stacked.DENSE rows the spectral radius is that of all eigenvalues of (31). Beyond, it is an eigenvalue that
+    Arnoldi's method finds, and ``spectral_radius_at_most`` is proven: by (14)-(15) the eigenvalues of (31) are those of
+    the A_id - K_id C_id and of Phi_u, and a Cholesky factor has shown that ||Phi_u|| < 1. Gains without such a norm
+    (``consensus: schur``) get all eigenvalues whatever it takes.
     Raises DesignError when a condition of the whole error system does not hold after all."""
     nodes, islands = network.nodes, network.islands.values()
+    errors = errors_of(specs, scenario.graph)
     detectable = max(own.rho for own in nodes.values())
-    undetectable = max(spectral_radius(island.phi) for island in islands)
-    rho = spectral_radius(Phi)
+    contracts = network.beta < 0
+    if contracts:
+        undetectable = max(_radius_of(island, say) for island in islands)
+        rho = errors.radius(say)
+        at_most = max(detectable, float(np.sqrt(1 + network.beta)))
+    else:
+        say(f"all eigenvalues of {errors.size}")
+        undetectable = max(spectral_radius(island.phi) for island in islands)
+        rho = spectral_radius(errors.dense())
+        at_most = rho
     conditions = _conditions(network, rho, scenario.options.consensus)
+    if contracts and errors.size > DENSE:  # two ways to the same number must agree
+        conditions["what Arnoldi's method finds is below the proven bound"] = _below(rho, at_most * (1 + 1e-6))
     if scenario.options.consensus == "robust":
-        conditions |= _losses(scenario.graph, specs)
+        conditions |= _losses(scenario.graph, specs, say)
     failed = [f"{name}: {c['value']:.6g}, needed {c['threshold']:g}" for name, c in conditions.items() if not c["ok"]]
     if failed:
         raise DesignError(f"the design does not hold what it should: {'; '.join(failed)}")
     return {
         "conditions": conditions,
-        "nodes": _nodes(network, predicted_rms(scenario, network, Phi)),
+        "nodes": _nodes(network, predicted_rms(scenario, network, errors, say)),
         "spectral_radius": rho,
+        "spectral_radius_at_most": at_most,
         "spectral_radius_detectable": detectable,
         "spectral_radius_undetectable": undetectable,
         "decomposition": scenario.options.decomposition,
@@ -101,6 +130,16 @@ def certificate(scenario: Scenario, network: Network, Phi: Array, specs: Mapping
         "rate_bound": None if network.beta >= 0 else float(np.sqrt(max(0.0, 1 + network.beta))),
         "beta_id": [own.beta for own in nodes.values()],
     }
+
+
+def _radius_of(island: Coupling, say: Say) -> float:
+    """Spectral radius of Phi_u."""
+    return largest_modulus(
+        island.pencil.N,
+        lambda X: island.pencil.drive(island.g, X),
+        lambda: island.phi,
+        lambda what: say(f"Phi_u: {what}"),
+    )
 
 
 def _conditions(network: Network, rho: float, consensus: str) -> dict[str, dict[str, Any]]:
@@ -128,13 +167,14 @@ def _conditions(network: Network, rho: float, consensus: str) -> dict[str, dict[
     return found
 
 
-def _losses(graph: Graph, specs: Mapping[int, NodeSpec]) -> dict[str, dict[str, Any]]:
+def _losses(graph: Graph, specs: Mapping[int, NodeSpec], say: Say) -> dict[str, dict[str, Any]]:
     """The largest eigenvalue of all graphs with one link lost, by the eigenvalues themselves."""
-    radii = {
-        loss.words(graph): spectral_radius(error_matrix_of(specs, without(graph, loss)))
-        for loss in losses(graph, 1)
-        if loss.links
-    }
+    radii = {}
+    for loss in losses(graph, 1):
+        if loss.links:
+            name = loss.words(graph)
+            say(f"eigenvalues with {name} lost")
+            radii[name] = errors_of(specs, without(graph, loss)).radius()
     if not radii:
         return {}
     worst = max(radii, key=lambda lost: radii[lost])
@@ -151,7 +191,7 @@ def _leak(own: Local) -> float:
     return max(norm(own.C @ U) / (norm(own.C) or 1.0), norm(D.T @ own.A @ U) / (norm(own.A) or 1.0))
 
 
-def _nodes(network: Network, rms: list[float]) -> dict[int, dict[str, Any]]:
+def _nodes(network: Network, rms: list[float | None]) -> dict[int, dict[str, Any]]:
     return {
         i: {
             "unknown_inputs": own.uio.basis.shape[1],

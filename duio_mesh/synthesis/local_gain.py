@@ -53,7 +53,8 @@ def worst_gain(system: Subsystem, K: Array) -> float:
     resolvents = np.exp(1j * angles)[:, None, None] * np.eye(len(A)) - closed
     inputs = np.hstack([K, -F])
     responses = np.linalg.solve(resolvents, np.broadcast_to(inputs, (len(angles), *inputs.shape)))
-    return float(np.linalg.norm(responses, 2, axis=(1, 2)).max())
+    squares = np.linalg.eigvalsh(responses.conj().transpose(0, 2, 1) @ responses)  # (2p, 2p), far smaller than d
+    return float(np.sqrt(squares.max(initial=0.0)))
 
 
 def hinf_gain(system: Subsystem, node: str) -> tuple[Array, float]:
@@ -79,32 +80,53 @@ def hinf_gain(system: Subsystem, node: str) -> tuple[Array, float]:
 
 def _bisection(system: Subsystem, node: str, confirmed: bool) -> tuple[Array, float]:
     low = float(np.hypot(norm(system.F), system.stir))  # the answer to an impulse begins with -F, whatever K is
-    K = _central_gain(system, np.inf, confirmed)
-    if K is None:
+    central = _central_gain(system, np.inf, confirmed)
+    if central is None:
         raise DesignError(
             f"{node}: no stabilising gain was found for its detectable part (eigenvalues of A_id: "
             f"{_numbers(np.linalg.eigvals(system.A))}). A mode is too close to being undetectable; measure it better."
         )
-    high = max(1.01 * worst_gain(system, K), low)
+    beta = max(1.01 * worst_gain(system, central.K), low)
     for _ in range(100):
-        better = _central_gain(system, high, confirmed)
+        better = _central_gain(system, beta, confirmed)
         if better is not None:
             break
-        high *= 1.5
+        beta *= 1.5
     else:
         raise DesignError(f"{node}: the H-infinity gain cannot be computed reliably; use local_gain: h2")
-    K = better
-    while high > low * (1 + TOLERANCE):
-        beta = max(np.sqrt(low * high), 0.1 * high)
+    feasible = [(beta, better)]
+    while feasible[-1][0] > low * (1 + TOLERANCE):
+        beta = _next(feasible, low)
         better = _central_gain(system, beta, confirmed)
         if better is None:
             low = beta
         else:
-            high, K = beta, better
-    return K, high
+            feasible.append((beta, better))
+    return feasible[-1][1].K, feasible[-1][0]
 
 
-def _central_gain(system: Subsystem, beta: float, confirmed: bool) -> Array | None:
+def _next(feasible: list[tuple[float, _Central]], low: float) -> float:
+    """Where the bisection looks next: where the room to X < beta^2 I is expected to end, else in the middle.
+
+    The largest beta^2 / |X| falls to 1 nearly linearly and from above a secant, so secants stay on the feasible side
+    and close in fast. Where something else ends the feasible interval, they leave it, and the middle is taken.
+    """
+    high, last = feasible[-1]
+    if len(feasible) > 1:
+        before, first = feasible[-2]
+        slope = (first.room - last.room) / (before - high)
+        end = high - (last.room - 1) / slope if slope > 0 else 0.0
+        if low < end * (1 - TOLERANCE / 2):
+            return end * (1 + TOLERANCE / 4) if high > end * (1 + TOLERANCE / 2) else end * (1 - TOLERANCE / 2)
+    return max(float(np.sqrt(low * high)), 0.1 * high)
+
+
+class _Central(NamedTuple):
+    K: Array
+    room: float  # beta^2 / |X|
+
+
+def _central_gain(system: Subsystem, beta: float, confirmed: bool) -> _Central | None:
     """The K of the Riccati equation for this beta, or None: no stabilising solution, or (``confirmed``) K misses beta.
 
     Solved by structured doubling: step k holds the equation's value after 2^k steps of the finite-horizon game.
@@ -132,7 +154,7 @@ def _central_gain(system: Subsystem, beta: float, confirmed: bool) -> Array | No
     except (np.linalg.LinAlgError, ValueError):  # singular, X >= beta^2 I somewhere, or no longer finite
         return None
     missed = confirmed and worst_gain(system, _array(K)) > beta * (1 + TOLERANCE)
-    return None if missed else _array(K)
+    return None if missed else _Central(_array(K), beta**2 / norm(X))
 
 
 def h2_gain(system: Subsystem, seen: Array, noise: Array, node: str) -> Array:

@@ -1,38 +1,50 @@
 """The matrix whose largest eigenvalue the coupling gains g minimise (seed 000, (38) and (49)), in blocks.
 
-    S(g, gamma) = gamma I - [F11, R'; R, 0],       R = Phi_u = A - Theta(g),  F11 = 0                           (norm)
-                                                   R = Theta(g),  F11 = A'A - A'Theta - Theta'A               (paper)
+    S(g, t) = t I - A'A + Theta'A + A'Theta - Theta'Theta / c >= 0,   c = 1 (norm), c = t (paper),   t = 1 + beta_u
 
-of size 2N with Theta(g) = sum_i g_i J_i J_i'T, T = U'(L x I_n) U. Its lower right block is gamma I, so everything that
-a barrier method asks of S^-1 follows from the N x N Schur complement S / gamma I = W^-1, and every product with T is
-made node by node and arc by arc: about 2 n N multiplications per column instead of N^2.
+with A = diag(A_iu) and Theta(g) = U' (diag(g) L x I_n) U. Nothing of size N x N is needed for a product: Theta X is
+made node by node and arc by arc, in about 2 n N multiplications per column of X (N, k).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import cached_property
 from typing import Literal, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import linalg, sparse
+from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigsh
 
 from duio_mesh.arrays import Array
-from duio_mesh.geometry.subspace import norm
 
 Criterion = Literal["paper", "norm"]
 
+DENSE = 150
+"""Up to so many rows all eigenvectors are computed: faster than Lanczos."""
 
-class Factored(NamedTuple):
-    """S at one point."""
 
-    g: Array  # (m,)
-    gamma: float
-    log_det: float  # -inf when S is not positive definite
-    L: Array  # (N, N) lower Cholesky factor of W^-1
+class Reduced(NamedTuple):
+    """X'S(g, t)X = t I - a + sum_i g_i b_i - sum_i g_i^2 c_i / (1 or t) for orthonormal X (N, k)."""
+
+    a: Array  # (k, k)
+    b: Array  # (m, k, k)
+    c: Array  # (m, k, k)
+    criterion: Criterion
+
+    @property
+    def k(self) -> int:
+        """Columns of X."""
+        return len(self.a)
+
+    def only(self, free: NDArray[np.bool_]) -> Reduced:
+        """With the other g_i = 0."""
+        return self._replace(b=self.b[free], c=self.c[free])
 
 
 class Pencil:
-    """S(g, gamma) for m nodes on one graph.
+    """S(g, t) for m nodes on one graph.
 
     ``A``: A_iu (nu_i, nu_i) of every node, ``U``: U_i (n, nu_i), ``laplacian`` (m, m).
     """
@@ -40,116 +52,146 @@ class Pencil:
     def __init__(self, A: Sequence[Array], U: Sequence[Array], laplacian: Array, criterion: Criterion) -> None:
         self.criterion: Criterion = criterion
         self.sizes = np.array([block.shape[1] for block in U])
-        self.N = int(self.sizes.sum())
+        self.m, self.N = len(U), int(self.sizes.sum())
         ends = np.cumsum(self.sizes)
         self._at = [slice(int(end - size), int(end)) for end, size in zip(ends, self.sizes, strict=True)]
         self._A, self._U, self._laplacian = tuple(A), tuple(U), sparse.csr_array(laplacian)
-        self.A = linalg.block_diag(*A)
-        stacked = np.hstack(U)
-        self.T = np.repeat(np.repeat(laplacian, self.sizes, axis=0), self.sizes, axis=1) * (stacked.T @ stacked)
-        self._square = self.A.T @ self.A
-        self.active = np.array([self.T[at].any() for at in self._at], dtype=bool)
+        self._hears = [np.flatnonzero(row) for row in laplacian]
+        self.active = np.array([bool(self._blocks(i)) for i in range(self.m)])
         """(m,) nodes whose gain has an effect: the others have no undetectable part, or hear nobody."""
 
-    def rows(self, g: Array, M: Array) -> Array:
-        """diag(g_i I) M."""
-        return np.asarray(np.repeat(g, self.sizes)[:, None] * M)
+    @cached_property
+    def T(self) -> Array:
+        """(N, N): Theta(g) = diag(g_i I) T. For small systems."""
+        return self.heard(np.eye(self.N))
 
     def phi(self, g: Array) -> Array:
-        """(N, N): Phi_u of (30)."""
-        return np.asarray(self.A - self.rows(g, self.T))
+        """(N, N): Phi_u = A - Theta of (30). For small systems."""
+        return np.asarray(linalg.block_diag(*self._A) - self._gains(g) * self.T)
 
-    def value(self, g: Array) -> float:
-        """The least gamma with S >= 0: ||Phi_u||_2 (norm), 1 + lambda_max of M_g of (41) (paper)."""
-        if self.criterion == "norm":
-            return norm(self.phi(g))
-        Theta = self.rows(g, self.T)
-        cross = self.A.T @ Theta
-        F = np.block([[self._square - cross - cross.T, Theta.T], [Theta, np.zeros_like(Theta)]])
-        return float(linalg.eigvalsh(F, subset_by_index=(len(F) - 1, len(F) - 1))[0])
+    def drive(self, g: Array, X: Array) -> Array:
+        """Phi_u X."""
+        return self._times_A(X) - self._gains(g) * self.heard(X)
 
-    def reach(self, gamma: float) -> Array:
-        """(m,): |g_i| is at most this wherever the value is at most gamma; infinite where g_i has no effect here.
+    def heard(self, X: Array) -> Array:
+        """T X: what every node hears of the columns of X (N, k), in the coordinates of its own U_i."""
+        return self._exchanged(X, self._laplacian)
 
-        ||Theta|| <= gamma + ||A|| (norm), or, completing the square in the Schur complement, ||Theta - gamma A||^2 <=
-        gamma^2 + gamma (gamma - 1) ||A||^2 (paper).
+    def leading(self, g: Array, count: int, start: Array) -> tuple[float, Array]:
+        """The least t with S(g, t) >= 0 as far as Lanczos' method sees, and orthonormal x (N, count) that show it.
+
+        ``start`` (N,) is where that method starts.
         """
-        size = norm(self.A)
         if self.criterion == "norm":
-            Theta = gamma + size
-        else:
-            Theta = gamma * size + np.sqrt(gamma**2 + max(0.0, gamma * (gamma - 1)) * size**2)
-        own = np.array([norm(self.T[at]) if active else 0.0 for at, active in zip(self._at, self.active, strict=True)])
-        return np.asarray(np.divide(Theta, own, out=np.full(len(own), np.inf), where=own > 0))
+            size, product = self.N, lambda X: self._drive_transposed(g, self.drive(g, X))
+        else:  # t is the largest eigenvalue of [A'A - A'Theta - Theta'A, Theta'; Theta, 0]
+            size, product = 2 * self.N, lambda X: self._paper_product(g, X)
+            start = np.append(start, np.zeros(self.N))
+        values, vectors = _largest(product, size, count, start)
+        basis, triangle = np.linalg.qr(vectors[: self.N])
+        return max(float(values[-1]), 0.0), basis[:, np.abs(np.diag(triangle)) > 1e-9]
 
-    def factor(self, g: Array, gamma: float) -> Factored:
-        """S at g and gamma."""
-        if not gamma > 0:
-            return Factored(g, gamma, -np.inf, self.A)
-        if self.criterion == "norm":
-            phi = self.phi(g)
-            schur = -(phi.T @ phi) / gamma
-        else:
-            Theta = self.rows(g, self.T)
-            cross = self._transposed_A(Theta)
-            schur = cross + cross.T - self._square - Theta.T @ Theta / gamma
-        schur[np.diag_indices(self.N)] += gamma
+    def reduced(self, X: Array) -> Reduced:
+        """On the columns of X (N, k), orthonormal."""
+        AX, TX = self._times_A(X), self.heard(X)
+        b = np.array([AX[at].T @ TX[at] for at in self._at])
+        c = np.array([TX[at].T @ TX[at] for at in self._at])
+        return Reduced(AX.T @ AX, b + b.transpose(0, 2, 1), c, self.criterion)
+
+    def holds(self, g: Array, t: float) -> bool:
+        """Whether S(g, t) > 0, proven by its Cholesky factor, which is made of the blocks that are not zero.
+
+        Two nodes have a block in S when somebody hears both (every node hears itself).
+        """
+        S: dict[tuple[int, int], Array] = {}
+        for j, size in enumerate(self.sizes):
+            S[j, j] = t * np.eye(size)
+        c = t if self.criterion == "paper" else 1.0
+        for i, own in enumerate(self._A):
+            theta = {j: float(g[i]) * block for j, block in self._blocks(i).items()}
+            if self.criterion == "norm":
+                theta[i] = theta.get(i, 0.0) - own  # -Phi_u instead of Theta: its square has all three terms
+            else:
+                S[i, i] -= own.T @ own
+                for j, block in theta.items():
+                    _add(S, i, j, own.T @ block)
+                    _add(S, j, i, block.T @ own)
+            for j, left in theta.items():
+                for k, right in theta.items():
+                    _add(S, j, k, -left.T @ right / c)
+        return _positive(S, self.m)
+
+    def _blocks(self, i: int) -> dict[int, Array]:
+        """T_ij = l_ij U_i'U_j that are not zero."""
+        found = {}
+        if self.sizes[i]:
+            for j in map(int, self._hears[i]):
+                block = float(self._laplacian[i, j]) * self._U[i].T @ self._U[j]
+                if block.any():
+                    found[j] = block
+        return found
+
+    def _gains(self, g: Array) -> Array:
+        return np.repeat(g, self.sizes)[:, None]
+
+    def _paper_product(self, g: Array, Z: Array) -> Array:
+        X, Y = Z[: self.N], Z[self.N :]
+        AX, gains = self._times_A(X), self._gains(g)
+        theta = gains * self.heard(X)
+        upper = self._transposed_A(AX - theta) + self._transposed_T(gains * (Y - AX))
+        return np.vstack([upper, theta])
+
+    def _drive_transposed(self, g: Array, Y: Array) -> Array:
+        return self._transposed_A(Y) - self._transposed_T(self._gains(g) * Y)
+
+    def _times_A(self, X: Array) -> Array:
+        return np.vstack([block @ X[at] for block, at in zip(self._A, self._at, strict=True)])
+
+    def _transposed_A(self, X: Array) -> Array:
+        return np.vstack([block.T @ X[at] for block, at in zip(self._A, self._at, strict=True)])
+
+    def _transposed_T(self, X: Array) -> Array:
+        return self._exchanged(X, self._laplacian.T)
+
+    def _exchanged(self, X: Array, weights: sparse.csr_array) -> Array:
+        said = np.stack([block @ X[at] for block, at in zip(self._U, self._at, strict=True)])
+        mixed = (weights @ said.reshape(self.m, -1)).reshape(said.shape)
+        return np.vstack([block.T @ part for block, part in zip(self._U, mixed, strict=True)])
+
+
+def _largest(
+    product: Callable[[Array], Array], size: int, count: int, start: Array
+) -> tuple[NDArray[np.float64], Array]:
+    """The largest eigenvalues of a symmetric operator, ascending, and their vectors."""
+    operator = LinearOperator((size, size), matvec=lambda x: product(x.reshape(size, 1)).ravel(), matmat=product)
+    if size > DENSE:
+        ncv = min(size, max(3 * count, 40))
         try:
-            L = linalg.cholesky(schur, lower=True, overwrite_a=True, check_finite=False)
+            values, vectors = eigsh(operator, k=count, which="LA", v0=start, ncv=ncv, tol=1e-6)
+            return values, vectors
+        except ArpackNoConvergence:
+            pass  # eigenvalues that lie very close; all of them, then
+    values, vectors = linalg.eigh(operator @ np.eye(size))
+    return values[-count:], vectors[:, -count:]
+
+
+def _add(S: dict[tuple[int, int], Array], i: int, j: int, block: Array) -> None:
+    S[i, j] = S[i, j] + block if (i, j) in S else block
+
+
+def _positive(S: dict[tuple[int, int], Array], m: int) -> bool:
+    """Block Cholesky elimination of the symmetric S, in place; only the nodes that still have a block with k count."""
+    for k in range(m):
+        below = sorted(i for i, j in S if j == k and i > k)
+        try:
+            L = linalg.cholesky(S[k, k], lower=True, check_finite=False)
         except linalg.LinAlgError:
-            return Factored(g, gamma, -np.inf, schur)
-        return Factored(g, gamma, float(2 * np.log(np.diag(L)).sum() + self.N * np.log(gamma)), L)
-
-    def derivatives(self, at: Factored) -> tuple[Array, Array]:
-        """Gradient (m + 1,) and Hessian (m + 1, m + 1) of -log det S in (g, gamma).
-
-        With P = [B; s I] and Q = [T'; 0], B = 0 and s = -1 (norm) or B = -A' and s = 1 (paper), dS/dg_i is minus the
-        symmetric product of the columns of node i; G = S^-1 = [W, K'; K, (I + K R') / gamma].
-        """
-        g, gamma, _, L = at
-        W = _inverse(L)
-        TW, AW = self._times_T(W), self._times_A(W)
-        own = np.eye(self.N) / gamma
-        if self.criterion == "norm":
-            sign, K = -1.0, (AW - self.rows(g, TW)) / gamma
-            TK = self._times_T(K.T)
-            MK = (self._times_A(K.T) - self.rows(g, TK)) / gamma
-            MW, TMW, PGP, G22 = K, TK, own + MK, own + MK
-        else:  # M = A - Theta / gamma
-            sign, K = 1.0, self.rows(g, TW) / gamma
-            TK, MW = self._times_T(K.T), AW - K
-            TMW = self._times_A(TW.T).T - TK
-            MK = self._times_A(K.T) - self.rows(g, TK) / gamma
-            PGP = own + self._times_A(MW.T) - self.rows(g, TMW) / gamma
-            G22 = own + self.rows(g, TK) / gamma
-        QGQ = self._times_T(TW.T)
-        trace = float(np.trace(W) + np.trace(G22))
-        square = float(np.sum(W * W) + 2 * np.sum(K * K) + np.sum(G22 * G22))
-        gradient = np.append(-2 * self._sums(np.diag(TMW)), -trace)
-        cross = 2 * self._sums(np.sum(MW * TW, axis=1) - np.sum((sign * own - MK) * TK, axis=1))
-        by_node = 2 * self._sums(self._sums(PGP * QGQ + TMW * TMW.T).T)
-        return gradient, np.block([[by_node, cross[:, None]], [cross[None, :], np.array([[square]])]])
-
-    def _sums(self, M: Array) -> Array:
-        """Sums of the rows (entries) of every node, (m, ...)."""
-        return np.array([M[at].sum(axis=0) for at in self._at])
-
-    def _times_A(self, M: Array) -> Array:
-        return np.vstack([block @ M[at] for block, at in zip(self._A, self._at, strict=True)])
-
-    def _transposed_A(self, M: Array) -> Array:
-        return np.vstack([block.T @ M[at] for block, at in zip(self._A, self._at, strict=True)])
-
-    def _times_T(self, M: Array) -> Array:
-        """T M: what every node hears of the columns of M, in the coordinates of its own U_i."""
-        said = np.stack([block @ M[at] for block, at in zip(self._U, self._at, strict=True)])
-        heard = (self._laplacian @ said.reshape(len(said), -1)).reshape(said.shape)
-        return np.vstack([block.T @ part for block, part in zip(self._U, heard, strict=True)])
-
-
-def _inverse(L: Array) -> Array:
-    """(L L')^-1."""
-    lower, info = linalg.lapack.dpotri(L, lower=1)
-    if info:
-        raise linalg.LinAlgError("a Cholesky factor with a zero on its diagonal")
-    return np.asarray(np.tril(lower) + np.tril(lower, -1).T)
+            return False
+        solved = {i: linalg.solve_triangular(L, S[i, k].T, lower=True, check_finite=False) for i in below}
+        for i in below:
+            for j in below:
+                if j <= i:
+                    _add(S, i, j, -solved[i].T @ solved[j])
+        for i in below:
+            del S[i, k]
+    return True

@@ -31,7 +31,9 @@ def radius_and_gradient(pencil: Pencil, g: Array) -> tuple[float, Array]:
     across = np.vdot(y, x)
     if radius and abs(across) > 1e-14:
         turn = values[k].conjugate() / radius / across
-        by_row = -np.real(turn * y.conj() * (pencil.T @ x))  # d lambda = y*(dPhi)x / y*x, dPhi = -J_i T_i dg_i
+        by_row = -np.real(
+            turn * y.conj() * pencil.heard(x[:, None])[:, 0]
+        )  # d lambda = y*(dPhi)x / y*x, dPhi = -J_i T_i dg_i
         np.add.at(slope, np.repeat(np.arange(len(g)), pencil.sizes), by_row)
     return radius, slope
 

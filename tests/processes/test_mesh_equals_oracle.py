@@ -12,13 +12,13 @@ import pytest
 
 import duio_mesh
 from duio_mesh.synthesis.design import Design
-from tests.conftest import TOPOLOGIES
+from tests.conftest import TOPOLOGIES, simulated
 
 pytestmark = [pytest.mark.mesh, pytest.mark.usefixtures("nothing_left")]
 
 STEPS, SEEDS = 40, (0, 1, 2)
 SLOW = {"admm_plain": (1, (0,))}  # 30,000 rounds a step
-NAMES = sorted(p.stem for p in TOPOLOGIES.glob("*.yaml"))
+NAMES = simulated()
 
 
 @cache

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import pytest
 
 import duio_mesh
 from tests.conftest import TOPOLOGIES
+from tests.report.synthetic import read_texts
 
 pytestmark = [pytest.mark.mesh, pytest.mark.usefixtures("nothing_left")]
 
@@ -45,7 +47,7 @@ def same(design: Any) -> duio_mesh.RunResult:
         assert found[array].tobytes() == values.tobytes(), array
     assert oracle.flagged is not None
     counted = {str(i): int(flags.sum()) for i, flags in zip(oracle.node_ids, oracle.flagged, strict=True)}
-    assert result.metrics["flagged"] == counted
+    assert {i: node["flagged"] for i, node in result.metrics["nodes"].items()} == counted
     assert sum("flags" in warning for warning in result.warnings) == sum(count > 0 for count in counted.values())
     return result
 
@@ -87,3 +89,22 @@ def test_the_faults_have_a_seed_of_their_own() -> None:
     )
     assert one.metrics["estimates_sha256"] == same_again.metrics["estimates_sha256"]
     assert one.metrics["estimates_sha256"] != other.metrics["estimates_sha256"]
+
+
+def test_the_recording_shows_every_flag_and_the_metrics_the_last_ones() -> None:
+    """A cut that does not heal: the lanes of the recording are the oracle's flags, and the verdict says so."""
+    faults = {"links": [{"loss": 0.1}], "cuts": [{"edges": [[1, 2]], "during": [10, 40]}]}
+    design = design_of("ring", faults, **{"run.convergence.rms_below": 1e9})
+    flagged = duio_mesh.simulate(design).flagged
+    result = duio_mesh.run(design, "run")
+    assert flagged is not None
+    for at, i in enumerate(design.nodes):
+        changes = dict(read_texts(result.folder / "recording.rrd", f"/flag/node_{i}", "StateChange:state"))
+        turns = np.flatnonzero(np.diff(flagged[at], prepend=not flagged[at, 0])).tolist()
+        assert changes == {k: "flagged" if flagged[at, k] else "trusted" for k in turns}
+        last = len(flagged[at]) - 1 - int(np.flatnonzero(~flagged[at])[-1])
+        assert last > 10
+        assert result.metrics["nodes"][str(i)]["flagged_last"] == last
+    assert result.metrics["verdict"] == "converged"
+    (remark,) = result.metrics["remarks"]
+    assert remark.startswith("nodes 1, 2, 3 and 4 flag their last ")

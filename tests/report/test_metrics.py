@@ -26,7 +26,7 @@ def make_trace(errors: list[list[list[float]]]) -> Trace:
 
 def scenario(steps: int, rms_below: float = 1.0, over_last: float = 0.5) -> Any:
     run = SimpleNamespace(convergence=Convergence(rms_below, over_last), steps=steps, seed=7)
-    return SimpleNamespace(run=run)
+    return SimpleNamespace(run=run, outside=None)
 
 
 def test_rms_is_per_component() -> None:

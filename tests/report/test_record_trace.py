@@ -139,14 +139,16 @@ def test_the_example_of_the_documentation_works(tmp_path: Path, monkeypatch: pyt
 
 
 def test_the_documentation_names_the_entities_that_there_are(tmp_path: Path) -> None:
-    trace = make_trace(what=np.ones((3, 50, 1)), vhat={3: np.ones((50, 1))})
+    flags = np.zeros((3, 50), dtype=bool)
+    trace = make_trace(what=np.ones((3, 50, 1)), vhat={3: np.ones((50, 1))}, flagged=flags)
     record_trace(tmp_path / "r.rrd", make_scenario(), trace)
     there = set(entities(tmp_path / "r.rrd"))
     table = [line for line in DOCS.read_text().splitlines() if line.startswith("| `/")]
     named = [name for line in table for name in re.findall(r"`(/[\w/]+)[^`]*`", line.split("|")[1])]
-    assert len(named) == 11
+    assert len(named) == 13
     elsewhere = {
         "/rates/node_3",
+        "/missing/node_3",
         "/rounds/residual/node_3",
         "/rounds/disagreement/node_3",
     }  # while a mesh runs; watched

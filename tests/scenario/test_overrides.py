@@ -85,7 +85,7 @@ def test_an_override_can_mend_a_file(topology: Path) -> None:
         ("nodes.2.C=[[1]]", ["nodes.2.C.0: should have 2 entries (one per state), not 1"]),
         ("nodes.2.C.0=[1, 0, 0]", ["nodes.2.C.0: should have 2 entries (one per state), not 3"]),
         ("graph.edges=[[1, 2], [2, 1]]", ["graph.edges.1: [2, 1] is an edge already"]),
-        ("timing={}", ["timing: is reserved for a later version"]),
+        ("timing={}", ["timing.mode: is missing"]),
         ("run.seed=[1", ["run.seed: is not valid YAML"]),
         ("run.seed={a: 1, a: 2}", ["run.seed.a: is given twice", "run.seed: should be a whole number"]),
         ("run.seed=&x 1", ["run.seed: anchors (&x) are not allowed"]),

@@ -9,6 +9,7 @@ import pytest
 from scipy import linalg
 
 from duio_mesh.errors import DesignError
+from duio_mesh.synthesis import barrier
 from duio_mesh.synthesis.consensus import Undetectable, couple
 from duio_mesh.synthesis.pencil import Pencil
 
@@ -102,46 +103,66 @@ def test_39_in_closed_form(a):
     """One mode a: gamma = a^2 - 2 a g + g^2 / gamma is least, a^2 / (1 + a^2), at g = a gamma."""
     one, nothing = Undetectable(np.array([[a]]), np.eye(2)[:, :1]), Undetectable(np.zeros((0, 0)), np.zeros((2, 0)))
     found = couple([one, nothing], np.array([[1.0, -1.0], [-1.0, 1.0]]), "paper")
-    assert found.g[0] == pytest.approx(a**3 / (1 + a**2), abs=1e-6)
+    assert found.g[0] == pytest.approx(a**3 / (1 + a**2), abs=1e-5)
     assert found.beta == pytest.approx(-1 / (1 + a**2), abs=1e-7)
     assert found.lower <= -1 / (1 + a**2) + 1e-12
 
 
+def stacked(parts, laplacian, criterion, g, t):
+    """S of (38) or (49) as a Schur complement, with Theta of (42) as it is printed."""
+    U, A, n = linalg.block_diag(*[p.U for p in parts]), linalg.block_diag(*[p.A for p in parts]), len(parts[0].U)
+    Theta = U.T @ np.kron(np.diag(g) @ laplacian, np.eye(n)) @ U
+    cross = A.T @ Theta
+    return t * np.eye(len(A)) - A.T @ A + cross + cross.T - Theta.T @ Theta / (t if criterion == "paper" else 1)
+
+
+def pencil_and_gains(criterion, directed=True, m=4, n=4):
+    parts, laplacian = random_network(4, m, n, directed=directed)
+    g = 0.1 * np.random.default_rng(0).standard_normal(m)
+    return parts, laplacian, Pencil([p.A for p in parts], [p.U for p in parts], laplacian, criterion), g
+
+
 @pytest.mark.parametrize("criterion", ["paper", "norm"])
 def test_derivatives_of_the_barrier(criterion):
-    """Against differences of log det of S, written out in full."""
-    parts, laplacian = random_network(4, directed=True)
-    pencil = Pencil([p.A for p in parts], [p.U for p in parts], laplacian, criterion)
-    rng = np.random.default_rng(0)
-    U, A, n = linalg.block_diag(*[p.U for p in parts]), linalg.block_diag(*[p.A for p in parts]), len(parts[0].U)
+    """Against differences of log det of X'SX, written out in full."""
+    parts, laplacian, pencil, g = pencil_and_gains(criterion)
+    X = np.linalg.qr(np.random.default_rng(1).standard_normal((pencil.N, 5)))[0]
+    z = np.append(g, 1.5 + pencil.leading(g, 1, np.ones(pencil.N))[0])
 
-    def barrier(z):
-        Theta = U.T @ np.kron(np.diag(z[:-1]) @ laplacian, np.eye(n)) @ U
-        if criterion == "norm":
-            F = np.block([[np.zeros_like(A), (A - Theta).T], [A - Theta, np.zeros_like(A)]])
-        else:
-            F = np.block([[A.T @ A - A.T @ Theta - Theta.T @ A, Theta.T], [Theta, np.zeros_like(A)]])
-        sign, value = np.linalg.slogdet(z[-1] * np.eye(len(F)) - F)
+    def value(z):
+        sign, found = np.linalg.slogdet(X.T @ stacked(parts, laplacian, criterion, z[:-1], z[-1]) @ X)
         assert sign > 0
-        return -value
+        return 7 * z[-1] - found
 
-    g = 0.1 * rng.standard_normal(len(parts))
-    z = np.append(g, 1.3 * pencil.value(g) + 0.5)
-    factored = pencil.factor(z[:-1], z[-1])
-    assert -factored.log_det == pytest.approx(barrier(z))
-    gradient, hessian = pencil.derivatives(factored)
+    problem = [pencil.reduced(X)]
+    gradient, hessian, bound = barrier._derivatives(problem, barrier._at(problem, z), 7.0)
+    assert bound < z[-1]
     h, I = 1e-4, np.eye(len(z))
-    slopes = [(barrier(z + h * d) - barrier(z - h * d)) / (2 * h) for d in I]
+    slopes = [(value(z + h * d) - value(z - h * d)) / (2 * h) for d in I]
     np.testing.assert_allclose(gradient, slopes, atol=1e-5 * np.abs(gradient).max())
     bends = [
         [
-            (barrier(z + h * (a + b)) - barrier(z + h * (a - b)) - barrier(z - h * (a - b)) + barrier(z - h * (a + b)))
+            (value(z + h * (a + b)) - value(z + h * (a - b)) - value(z - h * (a - b)) + value(z - h * (a + b)))
             / (4 * h * h)
             for b in I
         ]
         for a in I
     ]
     np.testing.assert_allclose(hessian, bends, atol=1e-4 * np.abs(hessian).max())
+
+
+@pytest.mark.parametrize("dense", [0, 1000])
+@pytest.mark.parametrize("criterion", ["paper", "norm"])
+def test_value_and_proof_against_the_whole_matrix(criterion, dense, monkeypatch):
+    """By Lanczos' method and by all eigenvectors; the block Cholesky factor exists just above, not just below."""
+    monkeypatch.setattr("duio_mesh.synthesis.pencil.DENSE", dense)
+    parts, laplacian, pencil, g = pencil_and_gains(criterion, m=9, n=7)
+    t, x = pencil.leading(g, 3, np.ones(pencil.N))
+    S = stacked(parts, laplacian, criterion, g, t)
+    assert np.linalg.eigvalsh(S)[0] == pytest.approx(0, abs=1e-9)
+    assert np.linalg.eigvalsh(x.T @ S @ x)[0] == pytest.approx(0, abs=1e-9)
+    assert pencil.holds(g, t + 1e-8)
+    assert not pencil.holds(g, t - 1e-8)
 
 
 def test_scales_far_apart():
@@ -155,13 +176,14 @@ def test_scales_far_apart():
 
 
 def test_a_badly_followed_path_is_right_or_refused(monkeypatch):
-    """With absurd barrier steps; and a point that is no optimum has no certificate."""
+    """With absurd barrier steps; and a value that the last Cholesky factor does not confirm is refused."""
     parts, laplacian = random_network(0)
     right = couple(parts, laplacian, "paper").beta
     for factor in (1e3, 1e5, 1e7, 1e9):
-        monkeypatch.setattr("duio_mesh.synthesis.eigenvalue.FACTOR", factor)
+        monkeypatch.setattr("duio_mesh.synthesis.barrier.GROWTH", factor)
         with contextlib.suppress(DesignError):
             assert couple(parts, laplacian, "paper").beta == pytest.approx(right, abs=1e-6)
-    monkeypatch.setattr("duio_mesh.synthesis.eigenvalue._centre", lambda problem, point, weight, say: point)
-    with pytest.raises(DesignError, match="was not solved"):
+    leading = Pencil.leading
+    monkeypatch.setattr(Pencil, "leading", lambda *args: (lambda t, x: (t - 1e-6, x))(*leading(*args)))
+    with pytest.raises(DesignError, match="Cholesky factor does not confirm"):
         couple(parts, laplacian, "paper")

@@ -1,0 +1,54 @@
+"""The processes of a run as the kernel sees them: who they are and what memory they hold."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from pathlib import Path
+from typing import NamedTuple
+
+PROC = Path("/proc")
+
+
+class Memory(NamedTuple):
+    """In MB; PSS counts a page that k processes share as 1/k of a page."""
+
+    rss: float
+    pss: float
+
+
+def descendants(pid: int) -> list[int]:
+    """All processes below this one."""
+    found: list[int] = []
+    for path in PROC.glob(f"{pid}/task/*/children"):
+        with contextlib.suppress(FileNotFoundError, ProcessLookupError):  # it has just ended
+            for child in map(int, path.read_text().split()):
+                found += [child, *descendants(child)]
+    return found
+
+
+def family() -> dict[str, int]:
+    """Name -> id of the processes of the run that this process launched, and of this one, `launcher`."""
+    found = {"launcher": os.getpid()}
+    for pid in descendants(os.getpid()):
+        with contextlib.suppress(FileNotFoundError, ProcessLookupError):
+            name = (PROC / str(pid) / "cmdline").read_bytes().split(b"\0")[0].decode(errors="replace")
+            if name.startswith("duio-"):
+                found[name.removeprefix("duio-")] = pid
+    return found
+
+
+def memory(pid: int) -> Memory:
+    """Raises FileNotFoundError or ProcessLookupError when the process has ended."""
+    lines = (PROC / str(pid) / "smaps_rollup").read_text().splitlines()
+    sizes = {line.split(":")[0]: int(line.split()[1]) / 1024 for line in lines[1:]}
+    return Memory(sizes["Rss"], sizes["Pss"])
+
+
+def memories() -> dict[str, Memory]:
+    """Of every process of the run that this process launched, and of this one."""
+    found = {}
+    for who, pid in family().items():
+        with contextlib.suppress(FileNotFoundError, ProcessLookupError, KeyError):
+            found[who] = memory(pid)
+    return found

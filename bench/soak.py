@@ -1,0 +1,130 @@
+"""A long run: does any process grow, is any frame lost, and are the estimates still the oracle's, bit for bit?
+
+    python bench/soak.py [--rounds 1000000] [--nodes 4] [--batch 1] [--no-record]
+
+The ring of topologies/admm_ring.yaml with `finite_time`: two rounds a step on a ring of four, so that plant, samples,
+credits, journals and recorder work as hard as the exchange between the nodes. The memory of every process (launcher
+and nursery included) is read 200 times at equal steps of progress; of each, the median of the last tenth of the run is
+compared with that of the second tenth. Ends with 1 where something grew, was lost, or differs.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import sys
+import tempfile
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import rings
+from interleave import machine
+from processes import Memory, memories
+
+from duio_mesh import launcher
+from duio_mesh.launcher import Progress
+from duio_mesh.supervisor import Supervisor
+from duio_mesh.synthesis.design import Design
+
+SAMPLES = 200
+GROWTH = 0.02  # of memory that counts as flat
+TENTHS = ((0.1, 0.2), (0.9, 1.0))  # of the run that are compared
+
+
+class Samples:
+    """The memory of every process at equal steps of progress."""
+
+    def __init__(self, steps: int) -> None:
+        self._steps, self._due = steps, 0
+        self.taken: list[tuple[float, dict[str, Memory]]] = []  # (part of the run, who -> memory)
+
+    def __call__(self, now: Progress) -> None:
+        """Called by the launcher ten times a second."""
+        if self._due <= now.steps < self._steps:
+            self._due = now.steps + self._steps // SAMPLES
+            self.taken.append((now.steps / self._steps, memories()))
+
+    def within(self, who: str, first: float, last: float) -> Memory:
+        """The medians over a part of the run. Raises SystemExit where it was never looked at."""
+        seen = [found[who] for at, found in self.taken if first <= at < last and who in found]
+        if not seen:
+            raise SystemExit(f"{who} was never looked at between {first:.0%} and {last:.0%} of the run: more --rounds")
+        return Memory(*(statistics.median(values) for values in zip(*seen, strict=True)))
+
+    def everybody(self) -> list[str]:
+        """Who was seen in the first and in the last of the two tenths, or in one of them."""
+        return sorted({who for at, found in self.taken if at >= TENTHS[0][0] for who in found}, key=_by_number)
+
+
+def _by_number(who: str) -> tuple[str, int]:
+    name, _, number = who.partition("-")
+    return name, int(number or 0)
+
+
+def growths(samples: Samples) -> list[str]:
+    """Print the table; who grew by more than ``GROWTH``."""
+    print("| process | RSS, MB | in the last tenth | change | PSS, MB | in the last tenth | change |")
+    print("|---|---|---|---|---|---|---|")
+    grown = []
+    for who in samples.everybody():
+        early, late = (samples.within(who, *tenth) for tenth in TENTHS)
+        cells = []
+        for kind, before, after in zip(Memory._fields, early, late, strict=True):
+            change = after / before - 1
+            cells += [f"{before:.2f}", f"{after:.2f}", f"{change:+.2%}"]
+            if abs(change) > GROWTH:
+                grown.append(f"{kind.upper()} of {who} changed by {change:+.2%}")
+        print(f"| {who} | {' | '.join(cells)} |")
+    return grown
+
+
+def losses(design: Design, metrics: Mapping[str, Any], done: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """Frames that were not sent, and frames that were refused."""
+    wrong = [f"{who} refused frames: {counts}" for who, counts in metrics["rejected"].items()]
+    rounds = metrics["rounds"]
+    for i, spec in design.nodes.items():
+        said = done[f"node-{i}"]
+        if said["frames"] != said["rounds"] * len(spec.tells) or said["rounds"] != rounds:
+            wrong.append(f"node {i} sent {said['frames']} frames in {said['rounds']} of {rounds} rounds")
+    blocks = -(-design.plant.steps // design.plant.block) * len(design.nodes)
+    if done["plant"]["frames"] != blocks:
+        wrong.append(f"the plant sent {done['plant']['frames']} frames instead of {blocks}")
+    return wrong
+
+
+def main() -> None:
+    """Run, print, judge."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rounds", type=int, default=1_000_000)
+    parser.add_argument("--nodes", type=int, default=4)
+    parser.add_argument("--batch", type=int, default=1, help="steps that share an exchange")
+    parser.add_argument("--no-record", action="store_true", help="without a recorder")
+    args = parser.parse_args()
+    per_step = rings.rounds_per_step(args.nodes)
+    steps = -(-args.rounds // per_step) * args.batch
+    design = rings.admm_ring(args.nodes, steps, {"fusion": "finite_time"}, batch=args.batch)
+    print(f"{machine()}\n", flush=True)
+    samples, begin = Samples(steps), time.monotonic()
+    with tempfile.TemporaryDirectory() as out, Supervisor() as supervisor:
+        result = launcher.run(design, Path(out) / "run", record=not args.no_record, show=samples, supervisor=supervisor)
+        done = {who: process.done for who, process in supervisor.processes.items()}
+    metrics = result.metrics
+    print(f"{metrics['rounds']} rounds, {steps} steps, {args.nodes} nodes; {metrics['messages']} frames between nodes;")
+    print(f"{metrics['rounds_per_second']:.0f} rounds/s, {time.monotonic() - begin:.0f} s in all\n", flush=True)
+    wrong = growths(samples) + losses(design, metrics, done) + list(result.warnings)
+    if metrics["rounds"] < args.rounds:
+        wrong.append(f"only {metrics['rounds']} rounds")
+    del result
+    with tempfile.TemporaryDirectory() as out:
+        oracle = launcher.run_in_process(design, Path(out) / "run", record=False).metrics["estimates_sha256"]
+    if oracle != metrics["estimates_sha256"]:
+        wrong.append(f"the estimates differ from the oracle's: {metrics['estimates_sha256']} and {oracle}")
+    print(f"\nestimates_sha256 {metrics['estimates_sha256']}, the oracle's {oracle}")
+    print("\n".join(wrong) or "no process grew, no frame was lost, the oracle's estimates")
+    sys.exit(1 if wrong else 0)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,29 @@
+"""What processes of other hosts said, from their collected logs: stands where a run on one host has its supervisor."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from duio_mesh.supervisor import Process, Supervisor
+
+
+class Logs(Supervisor):
+    """Knows processes by their logs; starts and ends none."""
+
+    def __init__(self) -> None:
+        self.processes = {}
+        self._beats = 0
+
+    def read(self, who: str, log: Path) -> None:
+        """Take in a process' log: JSON lines, as it wrote them to its log or to its standard output.
+
+        Raises ValueError when it is something else.
+        """
+        self.processes[who] = Process(who)
+        for number, line in enumerate(log.read_text(encoding="utf-8").splitlines(), 1):
+            try:
+                event = json.loads(line)
+                self._hear({**event, "who": who})
+            except (ValueError, KeyError, TypeError) as e:
+                raise ValueError(f"{log}:{number} is not an event of a process: {e}") from None
