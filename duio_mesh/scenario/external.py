@@ -87,6 +87,10 @@ def _check_run(document: Mapping[str, Any], problems: Problems) -> None:
     run, timing = document.get("run"), document.get("timing")
     if isinstance(run, Mapping) and run.get("batch", 1) != 1:
         problems.at(("run", "batch"), "should be 1: samples from outside come one by one")
+    if isinstance(run, Mapping) and run.get("on_node_loss", "stop") != "stop":
+        problems.at(("run", "on_node_loss"), "should be stop: a gateway cannot go back to old samples")
+    if document.get("hosts") is not None:
+        problems.at_key(("hosts",), "does not go with plant: external; the gateway's own host is the run's")
     if (timing.get("mode") if isinstance(timing, Mapping) else timing) not in (None, "lockstep"):
         problems.at(("timing",), "should be lockstep: with plant: external the sensors set the pace")
 
