@@ -116,6 +116,7 @@ def test_listening_beyond_this_host_has_to_be_said(tmp_path: Path) -> None:
             [("hall/{node}/y", "a\n  listen: tcp/localhost:1\n  connect: tcp/x:1")],
             "tiny.yaml:7:3: external.connect: give either listen or connect, not both",
         ),
+        ([("hall/{node}/y", "a\n  hold: 5")], "tiny.yaml:6:9: external.hold: should be less than run.deadline, 5 s"),
         ([("steps: 10", "steps: 10, batch: 2")], "run.batch: should be 1: samples from outside come one by one"),
         (
             [("run:", "timing: realtime\nrun:")],
