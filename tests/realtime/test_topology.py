@@ -41,7 +41,10 @@ def test_a_design_for_the_clock_has_the_same_gains_and_knows_what_to_do_without_
 
 def test_how_long_it_will_take_is_said_beforehand() -> None:
     assert in_words(LOCKSTEP, 100, processes=True) == ""
-    assert in_words(Timing("realtime", 0.02, 0.01), 100, processes=True) == "realtime: 100 ticks of 0.02 s, about 2 s in all"
+    assert (
+        in_words(Timing("realtime", 0.02, 0.01), 100, processes=True)
+        == "realtime: 100 ticks of 0.02 s, about 2 s in all"
+    )
     assert in_words(Timing("realtime", 60.0, 30.0), 101, processes=True).endswith("about 101 min in all")
     assert in_words(Timing("realtime", 60.0, 30.0), 480, processes=True).endswith("8 h in all")
 
