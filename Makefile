@@ -43,8 +43,9 @@ soak: $(VENV)/ready ## a million rounds: nothing grows, nothing is lost, the ora
 scaling: $(VENV)/ready ## the model of rounds per second, fitted and tested (as root: network namespaces); into docs/scaling.md
 	$(PY) bench/network.py --write
 
-reliability: $(VENV)/tests ## what every observer makes of every fault; the table of docs/reliability.md
+reliability: $(VENV)/tests ## what every observer makes of every fault; tables and figure of docs/reliability.md
 	OPENBLAS_NUM_THREADS=1 $(PY) bench/reliability.py --write
+	OPENBLAS_NUM_THREADS=1 $(PY) bench/admm_loss.py --write
 
 clean: ## remove the virtual environment and caches, keep runs/
 	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .hypothesis
