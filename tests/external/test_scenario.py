@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from math import inf
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from duio_mesh.errors import ScenarioError
 from duio_mesh.scenario import scenario_yaml
 from duio_mesh.scenario.model import Scenario
 from duio_mesh.spec import Outside
+from tests.conftest import ROOT, TOPOLOGIES
 from tests.scenario.broken import PLANT_FILE
 from tests.scenario.same import same
 from tests.scenario.stand_in import load
@@ -136,3 +138,27 @@ def test_what_is_refused(tmp_path: Path, edits: list[tuple[str, str]], problem: 
     with pytest.raises(ScenarioError) as refused:
         load(written(tmp_path, *edits))
     assert any(problem in found for found in refused.value.problems), refused.value.problems
+
+
+def test_the_page_shows_what_loads(tmp_path: Path) -> None:
+    """Every YAML block of docs/sensors.md and of the section in docs/topology-file.md, with what a whole file needs."""
+    page = (ROOT / "docs" / "sensors.md").read_text() + (ROOT / "docs" / "topology-file.md").read_text()
+    blocks = [
+        b for b in re.findall(r"^```yaml\n(.*?)^```$", page, re.M | re.S) if "keys:" in b or "plant: external" in b
+    ]
+    assert len(blocks) == 3
+    for block in blocks:
+        text = block
+        for key, rest in {
+            "plant": "plant: external\nexternal: {model: plants/heat9.yaml}\n",
+            "name": "name: page\n",
+            "observer": "observer: {method: lmi}\n",
+            "nodes": "nodes: {1: {C: [[0, 0, 0, 0, 1, 0, 0, 0, 0]]}}\n",
+            "graph": "graph: {edges: []}\n",
+            "run": "run: {steps: 10, convergence: {rms_below: 1}}\n",
+        }.items():
+            text += "" if re.search(rf"^{key}:", block, re.M) else rest
+        (tmp_path / "page.yaml").write_text(text)
+        (tmp_path / "plants").mkdir(exist_ok=True)
+        (tmp_path / "plants" / "heat9.yaml").write_text((TOPOLOGIES / "plants" / "heat9.yaml").read_text())
+        assert load(tmp_path / "page.yaml").outside
