@@ -130,11 +130,14 @@ def test_a_sensor_that_never_speaks_ends_the_run_by_its_key() -> None:
 
 
 def test_a_sensor_that_stops_ends_the_run_by_key_and_number() -> None:
+    """The first sample may take longer than any deadline; a later one may not."""
     made, endpoint = design()
-    made = replace(made, plant=replace(made.plant, deadline=1.0))
+    nodes = {i: replace(spec, deadline=1.0) for i, spec in made.nodes.items()}
+    made = replace(made, plant=replace(made.plant, deadline=1.0), nodes=nodes)
     over = threading.Event()
 
     def feed(outsider: Outsider) -> None:
+        over.wait(1.5)
         for k in range(5):
             outsider.row(k)
         outsider.row(5, without=(4,))
