@@ -20,6 +20,7 @@ from duio_mesh.arrays import Array, contiguous
 from duio_mesh.faults import UNDISTURBED, Incoming, Rule
 
 START = 30.0  # seconds for all processes of a run to find each other
+LEASE = 10.0  # seconds of silence after which a link counts as lost; a process that dies is noticed at once
 
 # the files in a process' folder of credentials
 USERS, PASSWORD = "users", "password"
@@ -56,6 +57,7 @@ class Wire:
     guard: Guard | None = None  # None: whoever reaches a port may speak
     mode: str = "peer"  # peer | client (of a router) | router
     start: float = START  # seconds for all processes of a run to find each other
+    lease: float = LEASE  # seconds of silence after which a link counts as lost
 
 
 UNWIRED = Wire("", (), ())

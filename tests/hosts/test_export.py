@@ -105,6 +105,7 @@ def test_each_container_gets_its_own_and_nobody_elses(form: str, transport: str)
     containers = list(in_compose() if form == "compose" else in_kubernetes())
     assert {c.who for c in containers} == (WHO | ROUTERS if transport == "routed" else WHO)
     assert len({c.wire.run for c in containers}) == 1
+    assert {(c.wire.start, c.wire.lease) for c in containers} == {(600.0, 20.0)}  # run.deadline is 20 s
     for c in containers:
         module = c.command[2]
         assert c.command[:2] == ["python", "-m"]
