@@ -41,9 +41,8 @@ def run(spec: PlantSpec, report: Report) -> None:
         samples = {i: mesh.speak([(keys.plant(i), f"plant -> {i}", ("plant", i))]) for i in ids}
         mesh.watch()
         mesh.meet()
-        _truth = mesh.speak(
-            [(keys.truth(), "plant -> recorder", ("plant", "recorder"))], drop=True
-        )  # that we shall never say
+        # nobody knows the truth; the recorder's barrier hangs on its key
+        _truth = mesh.speak([(keys.truth(), "plant -> recorder", ("plant", "recorder"))], drop=True)
         if spec.recorded and mesh.unanswered(RECORDER):
             report.warn(f"the recorder was not there after {RECORDER:g} s; starting without it")
         report("ready")
@@ -105,16 +104,16 @@ class Inlet:
                 self._report.beat()
                 credits.collect()  # so that nothing piles up while the sensors take their time
             self._tell()
-            if heard := self._world.get(
-                LOOK if self._outside.hold < limit else max(0.0, min(beat, begin + limit) - now)
-            ):
-                self._take(heard)
-                for more in self._world.at_once(
-                    DRAIN * len(self._outside.sizes)
-                ):  # a look at the step costs all its keys
-                    self._take(more)
+            self._hear(LOOK if self._outside.hold < limit else max(0.0, min(beat, begin + limit) - now))
         self._tell()
         return step
+
+    def _hear(self, timeout: float) -> None:
+        """Take the next messages, waiting for the first: several, because a look at the step costs all its keys."""
+        if heard := self._world.get(timeout):
+            self._take(heard)
+            for more in self._world.at_once(DRAIN * len(self._outside.sizes)):
+                self._take(more)
 
     def _take(self, heard: Heard) -> None:
         """One message: a sample, or nothing but a count."""

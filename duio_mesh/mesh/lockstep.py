@@ -61,6 +61,8 @@ def form(size: int) -> Form:
 class Line(Source):
     """One incoming link of a node."""
 
+    patient = False  # its sender itself says when it has waited too long, and may end early by an empty frame
+
     def __init__(self, mesh: Mesh, key: str, name: str, who: str, ready: Ready, window: int, room: int = 0) -> None:
         """``window``: steps that the sender may be ahead of us. ``room``: frames that may wait; 0: as below.
 
@@ -78,8 +80,6 @@ class Line(Source):
         self.receive = self._subscriber.handler.recv
         self.poll = self._subscriber.handler.try_recv
         mesh.sources.append(self)
-
-    patient = False  # its sender itself says when it has waited too long, and may end early by an empty frame
 
     def close(self) -> None:
         """End the wait of ``receive``, once it has returned everything that had come."""

@@ -64,7 +64,8 @@ class OutsideWorld:
             if outside.end:
                 self._kept.append(self._subscribe(outside.end, lambda _: self._queue.put(Heard("", b"", None))))
             if outside.strays:
-                self._kept.append(self._subscribe(outside.strays, partial(self._stray, frozenset(outside.sizes))))
+                known = frozenset((*outside.sizes, outside.end))
+                self._kept.append(self._subscribe(outside.strays, partial(self._stray, known)))
         except zenoh.ZError as e:
             raise RunError(f"the gateway could not {where} for the sensors: {e}") from None
 

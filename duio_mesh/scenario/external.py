@@ -64,6 +64,8 @@ def read_external(
     for i, node in nodes.items():
         if node is not None:
             _add_sizes(sizes, node, feeds[i], written.encoding, problems)
+    if written.end in sizes:
+        problems.at((*EXTERNAL, "end"), "is the key of a sensor")
     strays = (written.key or "").replace("{node}", "*")
     return Outside(
         listen="" if written.connect else written.listen or LISTEN,

@@ -119,6 +119,7 @@ def test_listening_beyond_this_host_has_to_be_said(tmp_path: Path) -> None:
             "tiny.yaml:7:3: external.connect: give either listen or connect, not both",
         ),
         ([("hall/{node}/y", "a\n  hold: 5")], "tiny.yaml:6:9: external.hold: should be less than run.deadline, 5 s"),
+        ([("hall/{node}/y", "hall/{node}/y\n  end: hall/7/y")], "tiny.yaml:6:8: external.end: is the key of a sensor"),
         ([("steps: 10", "steps: 10, batch: 2")], "run.batch: should be 1: samples from outside come one by one"),
         (
             [("run:", "timing: realtime\nrun:")],
