@@ -286,7 +286,7 @@ class Recording:
 
 
 def _enough(values: int, series: int, sends: int, most: int) -> int:
-    """Rows that one send of a series should hold: all series are to take so many sends for their values, one ``most``."""
+    """Rows that one send of a series should hold: all are to take so many sends, one of them ``most``."""
     return min(ROWS, max(1, values // series // max(1, min(most, sends // series))))
 
 
