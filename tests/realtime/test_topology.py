@@ -9,6 +9,8 @@ import pytest
 import duio_mesh
 from duio_mesh.report.timeliness import in_words, untimely
 from duio_mesh.scenario.model import LOCKSTEP, Timing
+from duio_mesh.scenario.problems import Problems
+from duio_mesh.scenario.timing import read_timing
 from tests.conftest import TOPOLOGIES
 from tests.scenario.broken import VALID
 from tests.scenario.stand_in import load
@@ -25,6 +27,13 @@ def test_timing_is_read_in_seconds(topology: Path) -> None:
     assert load(topology, "timing=realtime").timing == Timing("realtime", 1.0, 0.5)  # the plant's own period
     assert load(topology, "timing={mode: realtime, tick: 0.02}").timing == Timing("realtime", 0.02, 0.01)
     assert load(topology, "timing={mode: realtime, tick: 0.02, wait: 0.9}").timing.wait == pytest.approx(0.018)
+
+
+def test_nobody_comes_back_in_real_time() -> None:
+    for policy, refused in (("restart", True), ("degrade", False), ("stop", False)):
+        problems = Problems()
+        read_timing({"timing": {"mode": "realtime", "tick": 0.1}}, None, {"on_node_loss": policy}, problems)
+        assert bool(problems) == refused
 
 
 def test_a_design_for_the_clock_has_the_same_gains_and_knows_what_to_do_without_a_neighbour() -> None:
