@@ -1,5 +1,5 @@
 # One image for every process of a run: the launcher by default, or
-#   docker run IMAGE python -m duio_mesh.node --spec /spec/node-3.spec
+#   docker run --entrypoint python IMAGE -m duio_mesh.node --spec /spec/node-3.spec     (docs/deploy.md)
 FROM python:3.12-slim AS build
 WORKDIR /src
 COPY pyproject.toml README.md LICENSE ./

@@ -4,7 +4,7 @@ VENV := .venv
 PY := $(VENV)/bin/python
 TOPOLOGY ?= topologies/partitioned.yaml
 
-.PHONY: help run test check lint types schema bench reliability clean
+.PHONY: help run test check lint types schema bench scale soak scaling reliability clean
 
 help: ## this list
 	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 10
@@ -34,8 +34,18 @@ bench: $(VENV)/ready ## speed, as ratios inside one interleaved run; the tables 
 	$(PY) bench/startup.py
 	$(PY) bench/tape.py
 
-reliability: $(VENV)/tests ## what every observer makes of every fault; the table of docs/reliability.md
+scale: $(VENV)/ready ## rings of up to 128 sensor processes on this machine: speed, start, memory; into docs/scaling.md
+	$(PY) bench/scale.py --write
+
+soak: $(VENV)/ready ## a million rounds: nothing grows, nothing is lost, the oracle's estimates; into docs/scaling.md
+	$(PY) bench/soak.py --write
+
+scaling: $(VENV)/ready ## the model of rounds per second, fitted and tested (as root: network namespaces); into docs/scaling.md
+	$(PY) bench/network.py --write
+
+reliability: $(VENV)/tests ## what every observer makes of every fault; tables and figure of docs/reliability.md
 	OPENBLAS_NUM_THREADS=1 $(PY) bench/reliability.py --write
+	OPENBLAS_NUM_THREADS=1 $(PY) bench/admm_loss.py --write
 
 clean: ## remove the virtual environment and caches, keep runs/
 	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -11,9 +11,10 @@ PROC = Path("/proc")
 
 
 class Memory(NamedTuple):
-    """In MB; PSS counts a page that k processes share as 1/k of a page."""
+    """In MB. PSS counts a page that k processes share as 1/k of a page, so it changes with what others do."""
 
     rss: float
+    own: float  # anonymous: what it allocated or wrote to, no code and no files
     pss: float
 
 
@@ -42,7 +43,7 @@ def memory(pid: int) -> Memory:
     """Raises FileNotFoundError or ProcessLookupError when the process has ended."""
     lines = (PROC / str(pid) / "smaps_rollup").read_text().splitlines()
     sizes = {line.split(":")[0]: int(line.split()[1]) / 1024 for line in lines[1:]}
-    return Memory(sizes["Rss"], sizes["Pss"])
+    return Memory(sizes["Rss"], sizes["Anonymous"], sizes["Pss"])
 
 
 def memories() -> dict[str, Memory]:

@@ -1,6 +1,6 @@
 """Many sensor processes on one machine: rounds, start, memory, and the oracle's estimates, for rings of N nodes.
 
-    python bench/scale.py [--nodes 16 64 128] [--rounds 20000] [--repeat 5] [--record 64]
+    python bench/scale.py [--nodes 16 64 128] [--rounds 20000] [--repeat 5] [--record 64] [--write]
 
 The ring of bench/rings.py, `admm` with 199 rounds a step; N nodes do 4/N of the rounds, so that every run takes about
 as long. All N take turns in shuffled order. The speed is compared as rounds per second times N: on the same cores a
@@ -22,6 +22,7 @@ from typing import NamedTuple
 
 import rings
 from interleave import Contenders, Results, interleaved, machine, table
+from page import Page
 from processes import memories
 
 from duio_mesh import launcher
@@ -87,17 +88,21 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=20_000, help="of the ring of four; N nodes do 4/N of them")
     parser.add_argument("--record", type=int, nargs="*", default=[64], help="rings that are run with a recorder, too")
     parser.add_argument("--repeat", type=int, default=5)
+    parser.add_argument("--write", action="store_true", help="put the tables into docs/scaling.md")
     args = parser.parse_args()
-    print(f"{machine()}; {args.repeat} repetitions\n", flush=True)
+    page = Page("scaling.md", "rings")
+    page.say(f"{machine()}; {args.repeat} repetitions\n")
     runs: dict[str, list[Run]] = {}
     results: Results = interleaved(contenders([4, *args.nodes], args.record, args.rounds, runs), args.repeat)
-    print(table("ring", results, REFERENCE, "rounds/s times N"))
-    print("| ring | rounds/s | ready after, s | PSS of the largest node, MB | the oracle's estimates |")
-    print("|---|---|---|---|---|")
+    page.say(table("ring", results, REFERENCE, "rounds/s times N"))
+    page.say("| ring | rounds/s | ready after, s | PSS of the largest node, MB | the oracle's estimates |")
+    page.say("|---|---|---|---|---|")
     for name, of in ((name, runs[name]) for name in results):
         middle = [statistics.median(run[at] for run in of) for at in range(3)]
         same = "yes" if all(run.same for run in of) else "NO"
-        print(f"| {name} | {middle[0]:.0f} | {middle[1]:.2f} | {middle[2]:.1f} | {same} |")
+        page.say(f"| {name} | {middle[0]:.0f} | {middle[1]:.2f} | {middle[2]:.1f} | {same} |")
+    if args.write:
+        page.write()
     sys.exit(0 if all(run.same for of in runs.values() for run in of) else 1)
 
 

@@ -20,6 +20,7 @@ from duio_mesh.report.timeliness import in_words
 from duio_mesh.synthesis.design import Design
 
 SLOW = 0.1  # of an error left by a step that starts afresh: the estimate is not worth its name
+MANY = 16  # nodes or warnings, from which on only some are shown
 FEW = 8  # nodes whose errors are shown one by one
 
 _out = Console(highlight=False)
@@ -69,6 +70,15 @@ def errors_in_words(errors: Mapping[int, float]) -> str:
     return "  ".join(f"{name} e{i} {e:.1e}" for name, (e, i) in chosen)
 
 
+def chosen(nodes: Mapping[str, Mapping[str, Any]], by: str) -> list[tuple[str, Mapping[str, Any]]]:
+    """(name, node) of all nodes where they are not many; else the worst ``FEW``, the worst first, median and best."""
+    if len(nodes) <= MANY:
+        return list(nodes.items())
+    ranked = sorted(nodes.items(), key=lambda item: math.inf if item[1][by] is None else item[1][by], reverse=True)
+    (middle, median), (last, best) = ranked[len(ranked) // 2], ranked[-1]
+    return [*ranked[:FEW], (f"{middle} (median of {len(nodes)})", median), (f"{last} (best)", best)]
+
+
 class Watcher:
     """Tells the person where to watch live, and keeps the server until they have seen enough."""
 
@@ -95,8 +105,9 @@ def result(design: Design, result: RunResult, *, live: bool) -> None:
         what = "every node's distance from the mean estimate, and what it measures from what the others expect,"
     for column in ("node", *figures):
         table.add_column(column, justify="right")
-    for i, node in metrics["nodes"].items():
-        table.add_row(str(i), *(_number(node[name]) for name in figures.values()))
+    names = list(figures.values())
+    for name, node in chosen(metrics["nodes"], names[0]):
+        table.add_row(name, *(_number(node[name]) for name in names))
     _out.print(table)
     wanted = scenario.run.convergence
     words = f"[green]{good}[/]" if result.converged else f"[red]{bad}[/]"
@@ -113,8 +124,10 @@ def result(design: Design, result: RunResult, *, live: bool) -> None:
         _out.print(loss_in_words(loss))
     if len(losses) > FEW:
         _out.print(f"and {len(losses) - FEW} further losses (recovery in metrics.json)")
-    for warning in result.warnings:
+    for warning in result.warnings[:MANY]:
         _out.print(f"[yellow]warning:[/] {warning}")
+    if len(result.warnings) > MANY:
+        _out.print(f"and {len(result.warnings) - MANY} further warnings (logs/)")
     _out.print(f"results    {result.folder}")
     recording = result.folder / "recording.rrd"
     if recording.exists():

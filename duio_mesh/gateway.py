@@ -24,6 +24,7 @@ from duio_mesh.spec import Outside, PlantSpec
 
 BEAT = 0.5  # seconds between signs of life while nothing comes
 LOOK = 0.02  # seconds between looks at the clock where late sensors are given up
+DRAIN = 2  # messages of each sensor that are taken before the next look; the others wait where they cost nothing
 FEW = 6  # keys that a message names
 NO_SAMPLE = np.zeros(0)
 
@@ -41,9 +42,8 @@ def run(spec: PlantSpec, report: Report) -> None:
         samples = {i: mesh.speak([(keys.plant(i), f"plant -> {i}", ("plant", i))]) for i in ids}
         mesh.watch()
         mesh.meet()
-        _truth = mesh.speak(
-            [(keys.truth(), "plant -> recorder", ("plant", "recorder"))], drop=True
-        )  # that we shall never say
+        # nobody knows the truth; the recorder's barrier hangs on its key
+        _truth = mesh.speak([(keys.truth(), "plant -> recorder", ("plant", "recorder"))], drop=True)
         if spec.recorded and mesh.unanswered(RECORDER):
             report.warn(f"the recorder was not there after {RECORDER:g} s; starting without it")
         report("ready")
@@ -107,12 +107,16 @@ class Inlet:
                 self._report.beat()
                 credits.collect()  # so that nothing piles up while the sensors take their time
             self._tell()
-            if heard := self._world.get(
-                LOOK if self._outside.hold < limit else max(0.0, min(beat, begin + limit) - now)
-            ):
-                self._take(heard)
+            self._hear(LOOK if self._outside.hold < limit else max(0.0, min(beat, begin + limit) - now))
         self._tell()
         return step
+
+    def _hear(self, timeout: float) -> None:
+        """Take the next messages, waiting for the first: several, because a look at the step costs all its keys."""
+        if heard := self._world.get(timeout):
+            self._take(heard)
+            for more in self._world.at_once(DRAIN * len(self._outside.sizes)):
+                self._take(more)
 
     def _take(self, heard: Heard) -> None:
         """One message: a sample, or nothing but a count."""

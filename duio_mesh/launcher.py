@@ -20,6 +20,7 @@ from duio_mesh import credentials
 from duio_mesh.arrays import Array
 from duio_mesh.errors import RunError
 from duio_mesh.faults import COUNTED
+from duio_mesh.limits import check_files
 from duio_mesh.recovery import Recovery
 from duio_mesh.report.description import describe
 from duio_mesh.report.metrics import metrics
@@ -213,6 +214,7 @@ def run(
     """
     scenario = design.scenario
     check_address(address, scenario.security)
+    check_files(len(design.nodes))
     with Supervisor() if supervisor is None else contextlib.nullcontext(supervisor) as supervisor:
         folder = RunFolder.create(scenario.name, out)
         write_inputs(folder, design)

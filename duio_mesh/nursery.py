@@ -93,7 +93,11 @@ class Nursery:
                 os.write(pipe, json.dumps(order).encode())
             os.close(pipe)
         elif "start" in order:
-            self._children[self._fork(order)] = who
+            try:
+                self._children[self._fork(order)] = who
+            except OSError as e:
+                text = f"{who} cannot be started: {e.strerror} (memory, or the limit of processes: ulimit -u)"
+                self._tell({"event": "failed", "who": who, "text": text})
         else:
             for pid in [pid for pid, name in self._children.items() if name == who]:
                 os.kill(pid, order["signal"])

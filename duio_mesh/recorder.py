@@ -19,7 +19,8 @@ from duio_mesh.process import Report, main
 from duio_mesh.report.recording import Recording
 from duio_mesh.spec import RecorderSpec
 
-RATE_PERIOD = 0.5  # seconds between two values of the rates, and between writes that nobody watches
+RATE_PERIOD = 0.5  # seconds between two values of the rates at first, and between writes that nobody watches
+RATES = 128  # values after which the rates are said half as often: a long run shall not fill memory with them
 
 
 class Rates:
@@ -27,12 +28,16 @@ class Rates:
 
     def __init__(self, recording: Recording) -> None:
         self._recording, self._at, self._seen = recording, time.monotonic(), dict[str, int]()
+        self._period, self._said = RATE_PERIOD, 0
 
     def look(self, newest: dict[str, int]) -> None:
         """Log the rates once in a while."""
         now = time.monotonic()
-        if (passed := now - self._at) < RATE_PERIOD:
+        if (passed := now - self._at) < self._period:
             return
+        self._said += 1
+        if self._said % RATES == 0:
+            self._period *= 2
         rates = {who: (k - self._seen.get(who, 0)) / passed for who, k in newest.items()}
         self._recording.rates(max(0, max(newest.values()) - 1), rates)
         self._at, self._seen = now, dict(newest)

@@ -21,6 +21,7 @@ from duio_mesh.faults import UNDISTURBED, Incoming, NodeFault, Rule
 
 START = 30.0  # seconds for all processes of a run to find each other
 PATIENCE = 3  # deadlines: where a run goes on without lost nodes, the launcher settles first who is lost
+LEASE = 10.0  # seconds of silence after which a link counts as lost; a process that dies is noticed at once
 
 # the files in a process' folder of credentials
 USERS, PASSWORD = "users", "password"
@@ -57,6 +58,7 @@ class Wire:
     guard: Guard | None = None  # None: whoever reaches a port may speak
     mode: str = "peer"  # peer | client (of a router) | router
     start: float = START  # seconds for all processes of a run to find each other
+    lease: float = LEASE  # seconds of silence after which a link counts as lost
 
 
 UNWIRED = Wire("", (), ())

@@ -8,7 +8,7 @@ from pathlib import Path
 from duio_mesh import credentials
 from duio_mesh.deploy.places import Place, Sites
 from duio_mesh.errors import ScenarioError
-from duio_mesh.spec import Guard, RouterSpec, Wire
+from duio_mesh.spec import LEASE, Guard, RouterSpec, Wire
 from duio_mesh.synthesis.design import Design
 from duio_mesh.wiring import Links, check_address, largest_frame
 
@@ -31,6 +31,7 @@ class SiteWiring:
         self._guarded = security.mode == "mtls"
         self._design, self._sites, self._links = design, sites, Links(design, record=sites.record)
         self._keys, self._secrets_at, self._start = keys, secrets_at, start
+        self._lease = max(LEASE, design.plant.deadline)  # a link may be down for as long as anyone may wait
         self._run, self._limit = secrets.token_hex(4), largest_frame(design)
 
     def wires(self) -> dict[str, Wire]:
@@ -48,6 +49,7 @@ class SiteWiring:
                 connect=tuple(self._endpoint(sites.places[other].dial) for other in dialled),
                 guard=self._guard(who, dialled),
                 start=self._start,
+                lease=self._lease,
             )
             for who, dialled in dials.items()
         }
@@ -62,7 +64,8 @@ class SiteWiring:
     def _behind_router(self, who: str) -> Wire:
         router = self._sites.behind[who]
         at = self._endpoint(self._sites.routers[router].dial)
-        return Wire(self._run, (), (at,), self._guard(who, (router,), router), mode="client", start=self._start)
+        guard = self._guard(who, (router,), router)
+        return Wire(self._run, (), (at,), guard, mode="client", start=self._start, lease=self._lease)
 
     def _router(self, who: str, place: Place) -> RouterSpec:
         sites = self._sites
@@ -83,7 +86,8 @@ class SiteWiring:
                 behind=sites.reached(who),
                 pairs=pairs,
             )
-        wire = Wire(self._run, (self._endpoint(place.listen),), connect, guard, mode="router", start=self._start)
+        listen = (self._endpoint(place.listen),)
+        wire = Wire(self._run, listen, connect, guard, mode="router", start=self._start, lease=self._lease)
         return RouterSpec(who, tuple(self._links.dials), wire)
 
     def _guard(self, who: str, dials: tuple[str, ...], through: str = "") -> Guard | None:

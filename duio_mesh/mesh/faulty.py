@@ -13,7 +13,7 @@ from typing import Protocol
 
 from duio_mesh.arrays import Array
 from duio_mesh.faults import Reception, Stamp
-from duio_mesh.mesh.lockstep import KNOCK, Line, LinkLost, Lockstep
+from duio_mesh.mesh.lockstep import Line, LinkLost, Lockstep
 from duio_mesh.mesh.session import Outlet
 from duio_mesh.mesh.spoiler import Spoiler
 from duio_mesh.spec import NodeSpec
@@ -112,5 +112,5 @@ class FaultyExchange:
     def _read_past(self, line: Line, k: int, r: int) -> None:
         """Take what has come on a line that we do not wait for."""
         while (sample := line.poll()) is not None:
-            if (data := sample.payload.to_bytes()) != KNOCK:
+            if (data := sample.payload.to_bytes()) != line.token:
                 self._lockstep.set_aside(line, data, k, r)

@@ -9,6 +9,7 @@ everything that the neighbour had sent.
 
 from __future__ import annotations
 
+import secrets
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -31,7 +32,6 @@ ROOM = 4  # frames per step of the window that may wait
 FEW = 48  # numbers
 TICK = 0.1  # seconds between the watchdog's looks
 SOON, PART = 1.0, 0.25  # a wait is worth a word after so many seconds, or this part of the deadline
-KNOCK = b""
 
 
 def soon(deadline: float) -> float:
@@ -73,6 +73,8 @@ def form(size: int) -> Form:
 class Line(Source):
     """One incoming link of a node."""
 
+    patient = False  # its sender itself says when it has waited too long, and may end early by an empty frame
+
     def __init__(self, mesh: Mesh, key: str, name: str, who: str, ready: Ready, window: int, room: int = 0) -> None:
         """``window``: steps that the sender may be ahead of us. ``room``: frames that may wait; 0: as below.
 
@@ -89,6 +91,7 @@ class Line(Source):
         handler = mesh.subscribe(key, zenoh.handlers.FifoChannel(self.room), ready).handler
         self.receive, self.poll = handler.recv, handler.try_recv
         self._mesh, self._key = mesh, key
+        self.token = secrets.token_bytes(8)  # a knock: nobody else can know it
         mesh.sources.append(self)
 
     def expect(self, before: int) -> None:
@@ -97,10 +100,8 @@ class Line(Source):
         self.gone = not self._mesh.alive(Member(self.who, before))  # in this order, no death goes unnoticed
 
     def knock(self) -> None:
-        """Let ``receive`` return ``KNOCK``, after everything that has come."""
-        self._mesh.tell_self(self._key, KNOCK)
-
-    patient = False  # its sender itself says when it has waited too long, and may end early by an empty frame
+        """Let ``receive`` return ``token``, after everything that has come."""
+        self._mesh.tell_self(self._key, self.token)
 
 
 class Lockstep:
@@ -152,7 +153,7 @@ class Lockstep:
                 line.last = (k, r)
                 self._at = None
                 return np.frombuffer(data, FLOAT64, size, start)
-            if data == KNOCK:
+            if data == line.token:
                 self._answer(line, k, r)
             else:
                 self.set_aside(line, data, k, r)
@@ -165,7 +166,7 @@ class Lockstep:
         self._at = (line, 0, r)
         while True:
             data: bytes = line.receive().payload.to_bytes()
-            if data == KNOCK:
+            if data == line.token:
                 self._answer(line, 0, r)
                 continue
             try:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from queue import Empty, SimpleQueue
 from types import TracebackType
@@ -64,7 +64,8 @@ class OutsideWorld:
             if outside.end:
                 self._kept.append(self._subscribe(outside.end, lambda _: self._queue.put(Heard("", b"", None))))
             if outside.strays:
-                self._kept.append(self._subscribe(outside.strays, partial(self._stray, frozenset(outside.sizes))))
+                known = frozenset((*outside.sizes, outside.end))
+                self._kept.append(self._subscribe(outside.strays, partial(self._stray, known)))
         except zenoh.ZError as e:
             raise RunError(f"the gateway could not {where} for the sensors: {e}") from None
 
@@ -82,6 +83,11 @@ class OutsideWorld:
             return self._queue.get(timeout=timeout)
         except Empty:
             return None
+
+    def at_once(self, most: int) -> Iterator[Heard]:
+        """Of the messages that are here already the next ones, ``most`` at most."""
+        for _ in range(min(most, self._queue.qsize())):
+            yield self._queue.get()  # nobody else takes from it
 
     def _subscribe(self, key: str, callback: Callable[[Any], None]) -> Any:
         return self._session.declare_subscriber(key, zenoh.handlers.Callback(callback, indirect=False))

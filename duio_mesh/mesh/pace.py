@@ -48,6 +48,8 @@ class Pace:
             self._credits.wait(1)
             self._zero = time.monotonic() - self._tick
         due = self._zero + k * self._tick
+        far = k - self._window // 2
+        behind = self._credits.behind(far) if far > 0 and time.monotonic() > due else []  # now, before they catch up
         start = max(due, self._sent + self._wait)
         while (left := start - time.monotonic()) > 0:
             self._credits.listen(left)
@@ -55,5 +57,4 @@ class Pace:
         late = self._sent - due
         self.said["late_ticks"] += late > LATE * self._tick
         if late > self.said["worst_lateness"]:
-            far = k - self._window // 2
-            self.said.update(worst_lateness=late, behind=self._credits.behind(far) if far > 0 else [])
+            self.said.update(worst_lateness=late, behind=behind)

@@ -48,6 +48,7 @@ def configured(wire: Wire) -> zenoh.Config:
         "connect/retry": {"period_init_ms": 10, "period_max_ms": 100, "period_increase_factor": 1.5},
         "connect/timeout_ms": int(wire.start * 1000),
         "connect/exit_on_failure": True,
+        "transport/link/tx/lease": int(wire.lease * 1000),
         "open/return_conditions/connect_scouted": False,  # else every open waits half a second for scouting
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,

@@ -24,6 +24,7 @@ from duio_mesh.spec import RecorderSpec
 
 SENDS = 20  # of one series in a whole run: each leaves some kB with Rerun until the file is closed ...
 LIVE_SENDS = 100  # ... where somebody may watch: a viewer is behind by one percent of the plot's width at most
+RATES = 16  # of one process that are sent at once where nobody watches
 CHUNKS = 8_000  # sends of a whole run, all series: each costs 50 microseconds and 2 kB whatever is in it
 
 
@@ -47,6 +48,7 @@ class Recording:
         self._file = FileStream(Path(spec.recording), opening)
         self._live = LiveStream(opening) if spec.live else None
         self._closed, self._watched = False, set[int]()
+        self._rates = dict[str, Buffer]()
 
         self._middle = Middle(spec.n, entities.ids, spec.steps) if spec.outside else None
         self._pairing = self._middle or Pairing(spec.n, entities.ids, spec.steps)
@@ -133,7 +135,10 @@ class Recording:
     def rates(self, k: int, values: Mapping[str, float]) -> None:
         """Steps per second of processes (plant, node-3) at step k; about once a second is enough."""
         for who, value in values.items():
-            self._send(self._entities.rate(who), [k], rr.Scalars.columns(scalars=[float(value)]))
+            if who not in self._rates:
+                together = 1 if self._spec.live else RATES
+                self._rates[who] = Buffer([self._entities.rate(who)], together, self._scalars)
+            self._rates[who].add(np.array([k]), np.array([[float(value)]]))
 
     def missing_neighbours(self, node: int, k: int, counts: Array) -> None:
         """How many neighbours a node went on without in the steps from k on (m,), in a run on the wall clock."""
@@ -261,7 +266,8 @@ class Recording:
                 self.estimates(source, k + first, part)
 
     def _buffers(self) -> list[Buffer]:
-        return [*self._errors.values(), *self._states.values(), *(self._gaps.buffers.values() if self._gaps else ())]
+        said = (*self._errors.values(), *self._states.values(), *self._rates.values())
+        return [*said, *(self._gaps.buffers.values() if self._gaps else ())]
 
     def _scalars(self, path: str, steps: NDArray[np.int64], values: Array) -> None:
         self._send(path, steps, rr.Scalars.columns(scalars=values))
@@ -280,7 +286,7 @@ class Recording:
 
 
 def _enough(values: int, series: int, sends: int, most: int) -> int:
-    """Rows that one send of a series should hold: all series are to take so many sends for their values, one ``most``."""
+    """Rows that one send of a series should hold: all are to take so many sends, one of them ``most``."""
     return min(ROWS, max(1, values // series // max(1, min(most, sends // series))))
 
 

@@ -60,7 +60,7 @@ def in_words(timing: Timing, steps: int, *, processes: bool) -> str:
         return ""
     if not processes:
         return "timing: realtime in one process is the ideal network: in lockstep, nothing late, nothing missing"
-    return f"realtime: {steps} ticks of {timing.tick:g} s, {_duration(steps * timing.tick)} in all"
+    return f"realtime: {steps} ticks of {timing.tick:g} s, about {_duration(steps * timing.tick)} in all"
 
 
 def _duration(seconds: float) -> str:

@@ -119,8 +119,8 @@ def _check_order(nodes: Sequence[NodeFault], path: Path, problems: Problems) -> 
     for k, fault in enumerate(nodes):
         others = Faults(nodes=tuple(other for other in nodes if other is not fault)).absences(fault.node)
         for first, after in others:
-            if first <= fault.step < after:
-                until = "for good" if after == ALWAYS[1] else f"until step {after}"
+            if first <= fault.step <= after:
+                until = "for good" if after == ALWAYS[1] else f"and back in step {after}"
                 problems.at(
                     (*path, k, fault.what), f"node {fault.node} is not there: it is gone from step {first} {until}"
                 )

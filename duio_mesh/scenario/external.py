@@ -55,7 +55,7 @@ def read_external(
         return None
     if written.model is not None:
         problems.at_key((*EXTERNAL, "model"), "belongs to 'plant: external'; to take another model: plant: FILE")
-    _check_run(document, problems)
+    _check_run(document, written.hold, problems)
     _check_endpoints(written, problems)
     for name in ("key", "end"):
         _check_key((getattr(written, name) or "x").replace("{node}", "1"), (*EXTERNAL, name), problems)
@@ -64,6 +64,8 @@ def read_external(
     for i, node in nodes.items():
         if node is not None:
             _add_sizes(sizes, node, feeds[i], written.encoding, problems)
+    if written.end in sizes:
+        problems.at((*EXTERNAL, "end"), "is the key of a sensor")
     strays = (written.key or "").replace("{node}", "*")
     return Outside(
         listen="" if written.connect else written.listen or LISTEN,
@@ -82,11 +84,18 @@ def _has_keys(node: Any) -> bool:
     return isinstance(node, Mapping) and node.get("keys") is not None
 
 
-def _check_run(document: Mapping[str, Any], problems: Problems) -> None:
+def _check_run(document: Mapping[str, Any], hold: float | None, problems: Problems) -> None:
     """What does not go together with samples that come when they come."""
     run, timing = document.get("run"), document.get("timing")
     if isinstance(run, Mapping) and run.get("batch", 1) != 1:
         problems.at(("run", "batch"), "should be 1: samples from outside come one by one")
+    if isinstance(run, Mapping) and run.get("on_node_loss", "stop") != "stop":
+        problems.at(("run", "on_node_loss"), "should be stop: a gateway cannot go back to old samples")
+    deadline = run.get("deadline", schema.Run.model_fields["deadline"].default) if isinstance(run, Mapping) else inf
+    if hold is not None and isinstance(deadline, int | float) and hold >= deadline:
+        problems.at((*EXTERNAL, "hold"), f"should be less than run.deadline, {deadline:g} s, when the run fails")
+    if document.get("hosts") is not None:
+        problems.at_key(("hosts",), "does not go with plant: external; the gateway's own host is the run's")
     if (timing.get("mode") if isinstance(timing, Mapping) else timing) not in (None, "lockstep"):
         problems.at(("timing",), "should be lockstep: with plant: external the sensors set the pace")
 

@@ -29,6 +29,12 @@ def read_timing(
             f"should be 1 under timing: realtime, not {run['batch']}: every tick has its own estimate, and a batch "
             "would hold it back",
         )
+    if run.get("on_node_loss") == "restart":
+        problems.at(
+            ("run", "on_node_loss"),
+            "cannot be restart under timing: realtime: who comes back joins at an agreed step, for which the others would "
+            "have to wait; choose stop or degrade",
+        )
     tick = timing.tick
     if tick is None and plant is not None:
         tick = plant.step

@@ -55,8 +55,10 @@ class Steps:
         number = feed.arrived if sample.number is None else sample.number
         if number in feed.waiting or (self.started and number < feed.base + self.k):
             raise Refused("seen before")
-        if len(feed.waiting) >= BACKLOG or (self.started and number - feed.base - self.k >= BACKLOG):
+        if self.started and (len(feed.waiting) >= BACKLOG or number - feed.base - self.k >= BACKLOG):
             raise Refused("too far ahead")
+        if len(feed.waiting) >= BACKLOG:  # others have not spoken yet: the oldest will hardly be needed
+            feed.waiting.pop(next(iter(feed.waiting)))
         feed.counts, feed.arrived, feed.newest = counts, feed.arrived + 1, max(feed.newest, number)
         feed.waiting[number] = sample.values
         if not self.started:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import socket
+import struct
 import threading
 from collections.abc import Callable, Mapping
 from contextlib import contextmanager
@@ -71,11 +72,12 @@ def driven(made: Design, samples: Mapping[int, Array]) -> Array:
 
 
 class Outsider:
-    """A Zenoh client of the gateway, as somebody else would write it."""
+    """A Zenoh client of the gateway, as somebody else would write it; or a peer behind a router, as a ROS 2 node is."""
 
-    def __init__(self, endpoint: str) -> None:
+    def __init__(self, endpoint: str, mode: str = "client") -> None:
         config = zenoh.Config()
-        config.insert_json5("mode", '"client"')
+        config.insert_json5("mode", json.dumps(mode))
+        config.insert_json5("scouting/multicast/enabled", "false")
         config.insert_json5("connect/endpoints", json.dumps([endpoint]))
         config.insert_json5("connect/timeout_ms", "20000")
         config.insert_json5("connect/retry", json.dumps({"period_init_ms": 20, "period_max_ms": 50}))
@@ -88,7 +90,7 @@ class Outsider:
             block = zenoh.CongestionControl.BLOCK
             self._publishers[key] = self.session.declare_publisher(key, congestion_control=block)
             wait_for(lambda: self._publishers[key].matching_status.matching)
-        attachment = None if number is None else number.to_bytes(8, "little", signed=True)
+        attachment = None if number is None else struct.pack("<qqB", number, 0, 16) + bytes(16)  # as rmw_zenoh has it
         self._publishers[key].put(payload, attachment=attachment)
 
     def row(self, k: int, without: tuple[int, ...] = ()) -> None:
@@ -102,13 +104,24 @@ class Outsider:
 
 
 @contextmanager
-def feeding(endpoint: str, feed: Callable[[Outsider], None]) -> Any:
+def router(endpoint: str) -> Any:
+    """A Zenoh router, set up like that of rmw_zenoh: gossip, no multicast."""
+    config = zenoh.Config()
+    config.insert_json5("mode", '"router"')
+    config.insert_json5("listen/endpoints", json.dumps([endpoint]))
+    config.insert_json5("scouting/multicast/enabled", "false")
+    with zenoh.open(config) as session:
+        yield session
+
+
+@contextmanager
+def feeding(endpoint: str, feed: Callable[[Outsider], None], mode: str = "client") -> Any:
     """``feed`` runs beside the body, on a thread and a session of its own; its exception is the test's."""
     wrong: list[BaseException] = []
 
     def work() -> None:
         try:
-            outsider = Outsider(endpoint)
+            outsider = Outsider(endpoint, mode)
             try:
                 feed(outsider)
             finally:

@@ -19,9 +19,11 @@ import zenoh
 import duio_mesh
 from duio_mesh import cli
 from duio_mesh.errors import RunError, ScenarioError
-from duio_mesh.spec import PlantSpec, read_spec
+from duio_mesh.journal import map_rows
+from duio_mesh.spec import NodeSpec, PlantSpec, read_spec, write_spec
+from duio_mesh.wiring import Wiring
 from tests.conftest import ROOT, wait_for
-from tests.external.feeding import IDS, TOPOLOGY, Outsider, base, design, driven, feeding, free_port, rooms
+from tests.external.feeding import IDS, TOPOLOGY, Outsider, base, design, driven, feeding, free_port, rooms, router
 from tests.processes.running import Running
 
 pytestmark = [pytest.mark.mesh, pytest.mark.usefixtures("nothing_left")]
@@ -36,7 +38,7 @@ def shortened() -> dict[int, np.ndarray]:
 def test_the_documented_example_gives_the_bits_of_its_file() -> None:
     """Two terminals, as docs/sensors.md has it; the publisher's word ends the run long before its last step."""
     endpoint = f"tcp/127.0.0.1:{free_port()}"
-    with Running(TOPOLOGY.name, "--set", f"external.listen={endpoint}", "--plot", steps=1000) as run:
+    with Running(TOPOLOGY.name, "--set", f"external.listen={endpoint}", steps=1000) as run:
         example = [sys.executable, str(ROOT / "examples" / "replay_csv.py"), str(ROOT / "examples" / "rooms.csv")]
         subprocess.run([*example, endpoint, "0"], check=True, timeout=60)
         assert run.end() == 0, run.stderr
@@ -60,7 +62,6 @@ def test_the_documented_example_gives_the_bits_of_its_file() -> None:
         assert node["disagreement"] == pytest.approx(np.sqrt(np.mean(apart**2)), rel=1e-12)
         assert node["residual"] == pytest.approx(np.sqrt(np.mean(np.square(missed))), rel=1e-12)
     assert (run.out / "recording.rrd").exists()
-    assert list(run.out.glob("*.png"))
 
 
 def spoil(outsider: Outsider, k: int, run: Path) -> None:
@@ -129,11 +130,14 @@ def test_a_sensor_that_never_speaks_ends_the_run_by_its_key() -> None:
 
 
 def test_a_sensor_that_stops_ends_the_run_by_key_and_number() -> None:
+    """The first sample may take longer than any deadline; a later one may not."""
     made, endpoint = design()
-    made = replace(made, plant=replace(made.plant, deadline=1.0))
+    nodes = {i: replace(spec, deadline=1.0) for i, spec in made.nodes.items()}
+    made = replace(made, plant=replace(made.plant, deadline=1.0), nodes=nodes)
     over = threading.Event()
 
     def feed(outsider: Outsider) -> None:
+        over.wait(1.5)
         for k in range(5):
             outsider.row(k)
         outsider.row(5, without=(4,))
@@ -169,7 +173,7 @@ def test_a_late_sensor_keeps_its_last_value_and_is_counted() -> None:
     assert "building/2/y: 2 samples were late; the last value before was used" in result.warnings
 
 
-def test_one_key_for_every_number_in_the_form_of_ros() -> None:
+def test_one_key_for_every_number_in_the_form_of_ros_through_a_router() -> None:
     """Fifteen topics of std_msgs/Float64, one of them heard by two nodes; each publisher counts from its own number."""
     made, endpoint = design()
     names = {i: [f"0/n{i}/v{at}/std_msgs::msg::dds_::Float64_" for at in range(4)] for i in IDS}
@@ -179,6 +183,8 @@ def test_one_key_for_every_number_in_the_form_of_ros() -> None:
     assert made.plant.outside is not None
     outside = replace(
         made.plant.outside,
+        listen="",
+        connect=endpoint,
         encoding="std_msgs/Float64",
         feeds=feeds,
         sizes=dict.fromkeys((f"{key}/*" for key in keys), 1),
@@ -196,12 +202,42 @@ def test_one_key_for_every_number_in_the_form_of_ros() -> None:
                 outsider.put(f"{key}/RIHS01_{n:064x}", payload, number=1 + 7 * n + k)
         outsider.end()
 
-    with feeding(endpoint, feed):
+    with router(endpoint), feeding(endpoint, feed, mode="peer"):
         result = duio_mesh.run(made, "run", record=False)
     samples = {i: table.copy() for i, table in shortened().items()}
     samples[2][:, 1] = samples[1][:, 1]
     assert result.trace.xhat.tobytes() == driven(made, samples).tobytes()
     assert result.metrics["rejected"] == {}
+
+
+def test_processes_started_by_hand() -> None:
+    """The gateway and the nodes from their spec files, each by its own command, as a container would."""
+    made, endpoint = design()
+    wiring = Wiring(made, Path("keys"), record=False)
+    wires = wiring.wires()
+    specs: dict[str, NodeSpec | PlantSpec] = {f"node-{i}": spec for i, spec in made.nodes.items()} | {
+        "gateway": made.plant
+    }
+    running = {}
+    for who, spec in specs.items():
+        wire = wires["plant" if who == "gateway" else who]
+        write_spec(replace(spec, wire=wire, output=f"{who}.f64"), Path(f"{who}.spec"))
+        command = [sys.executable, "-m", f"duio_mesh.{who.split('-')[0]}", "--spec", f"{who}.spec"]
+        running[who] = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+
+    def feed(outsider: Outsider) -> None:
+        for k in range(SHORT):
+            outsider.row(k)
+        outsider.end()
+
+    with feeding(endpoint, feed):
+        said = {who: process.communicate(timeout=60)[0] for who, process in running.items()}
+    wiring.release()
+    assert {who: process.returncode for who, process in running.items()} == dict.fromkeys(specs, 0), said
+    expected = driven(made, shortened())
+    for at, i in enumerate(IDS):
+        assert map_rows(f"node-{i}.f64", 9).tobytes() == expected[at].tobytes()
+    assert map_rows("gateway.f64", 16).tobytes() == np.hstack([shortened()[i] for i in IDS]).tobytes()
 
 
 def test_an_interrupt_while_waiting_for_the_first_sample() -> None:

@@ -94,6 +94,17 @@ def test_late_sensors_keep_their_last_value_only_after_the_time_for_it() -> None
         steps.add("c", sample(3))
 
 
+def test_who_waits_long_for_the_others_begins_with_what_is_new(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(room, "BACKLOG", 4)
+    steps = Steps(KEYS, common=True)
+    for number in range(100):
+        steps.add("a", sample(number, number))
+    steps.add("b", sample(0, 98))
+    steps.add("c", sample(0, 97))
+    steps.add("c", sample(0, 98))
+    assert taken(steps) == [(98, 0, 0)]
+
+
 def test_what_is_refused_moves_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(room, "BACKLOG", 4)
     steps = Steps(KEYS, common=True, hold=inf)

@@ -14,7 +14,7 @@ import pytest
 
 import duio_mesh
 from duio_mesh.arrays import Array
-from duio_mesh.errors import DesignError
+from duio_mesh.errors import RunError
 from duio_mesh.faults import Edge
 from duio_mesh.synthesis.design import Design
 from duio_mesh.trace import Trace
@@ -211,6 +211,6 @@ def test_a_set_up_that_misses_a_message_says_so() -> None:
         faulty("admm_star", {"cuts": [{"edges": [[1, 2]], "during": [0, 1]}]}, **{"run.steps": 5})
 
 
-def test_what_is_not_built_is_refused() -> None:
-    with pytest.raises(DesignError, match="kill, pause and restart cannot be carried out yet"):
-        design_of("ring", {"nodes": [{"node": 1, "kill": 3}]})
+def test_a_kill_ends_the_run_unless_it_is_to_go_on() -> None:
+    with pytest.raises(RunError, match="node-1 was killed at step 3"):
+        duio_mesh.simulate(design_of("ring", {"nodes": [{"node": 1, "kill": 3}]}))

@@ -18,14 +18,14 @@ faults:
   cuts:
     - {edges: [[1, 2]], during: [4, 6]}
   nodes:
-    - {node: 1, kill: 5}
     - {node: 2, pause: 6, seconds: 1.5}
-    - {node: 2, restart: 7}
+    - {node: 1, restart: 7}
+    - {node: 2, restart: 8, away: 3}
 """
 
 
 def faults(tmp_path: Path, text: str) -> Faults:
-    (tmp_path / "t.yaml").write_text(VALID.replace("seed: 0", "seed: 42") + text)
+    (tmp_path / "t.yaml").write_text(VALID.replace("seed: 0", "seed: 42\n  on_node_loss: restart") + text)
     return load(tmp_path / "t.yaml").faults
 
 
@@ -39,7 +39,14 @@ def test_every_part_arrives(tmp_path: Path) -> None:
         (1, 2): (everywhere, burst, one_way, Rule(3, ALWAYS, delay_rounds=(4, 4)), cut),
         (2, 1): (everywhere, burst, cut),
     }
-    assert found.nodes == (NodeFault(1, "kill", 5), NodeFault(2, "pause", 6, 1.5), NodeFault(2, "restart", 7))
+    assert found.nodes == (
+        NodeFault(2, "pause", 6, 1.5),
+        NodeFault(1, "restart", 7, away=10),
+        NodeFault(2, "restart", 8, away=3),
+    )
+    assert found.absences(2) == ((8, 11),)
+    assert found.returns() == {11: (2,), 17: (1,)}
+    assert found.into(1, (2,)).absent == {2: ((8, 11),)}
 
 
 def test_a_sender_learns_only_what_it_has_to_do_itself(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ Everything is in namespaces of its own (the bridge, too), so that removing those
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import signal
@@ -19,6 +20,8 @@ import pytest
 from ruamel.yaml import YAML
 
 SWITCH = "switch"
+LIMIT = "rate 200kbit burst 4kb latency 400ms"
+TRIED = f"ip link add name b0 type bridge && tc qdisc add dev lo root tbf {LIMIT} && mount -t tmpfs none /run"
 CONTAINER = """
 mount -t tmpfs none /run
 mount -t tmpfs none /var/lib
@@ -40,8 +43,7 @@ def need_namespaces() -> None:
         pytest.skip(f"Python itself is in {covered[0]}, which the stand-in for a container hides")
     name = f"duio-{os.getpid()}-try"
     tried = subprocess.run(
-        f"ip netns add {name} && ip netns exec {name} sh -c 'ip link add name b0 type bridge && mount -t tmpfs none /run'; "
-        f"code=$?; ip netns del {name}; exit $code",
+        f"ip netns add {name} && ip netns exec {name} sh -c '{TRIED}'; code=$?; ip netns del {name}; exit $code",
         shell=True,
         capture_output=True,
         text=True,
@@ -85,12 +87,30 @@ class Network:
         for command in commands:
             self._run(f"ip netns exec {self.namespace(host)} {command}")
 
-    def up(self, folder: Path) -> None:
-        """What ``docker compose up`` does in each host's folder of an export."""
+    def up(self, folder: Path, *, without: str = "") -> None:
+        """What ``docker compose up`` does in each host's folder of an export, for all that are not up yet."""
         for host in self._addresses:
             document = YAML(typ="safe").load(folder / host / "compose.yaml")
             for who, service in document["services"].items():
-                self.containers[who] = Container(self.namespace(host), folder / host, service, document["secrets"])
+                if who not in self.containers and who != without:
+                    self.containers[who] = Container(self.namespace(host), folder / host, service, document["secrets"])
+
+    def reaches(self, host: str, address: str) -> bool:
+        """Whether something that listens on another host's first port can be dialled."""
+        code = f"import socket; socket.create_connection(('{address}', 7447), 0.5)"
+        command = ["ip", "netns", "exec", self.namespace(host), sys.executable, "-c", code]
+        return subprocess.run(command, capture_output=True).returncode == 0
+
+    def limit(self, host: str) -> None:
+        """Limit the bandwidth between a host and all others, in both directions."""
+        self.at(host, f"tc qdisc add dev eth0 root tbf {LIMIT}")
+        self.at(SWITCH, f"tc qdisc add dev {host} root tbf {LIMIT}")
+
+    def held_up(self, host: str) -> int:
+        """How many packets of a host had to wait for the limit."""
+        command = ["ip", "netns", "exec", self.namespace(host), "tc", "-s", "-j", "qdisc", "show", "dev", "eth0"]
+        (statistics,) = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+        return int(statistics["overlimits"])
 
     def ended(self, timeout: float = 60.0) -> dict[str, int]:
         """Wait for all containers; their exit codes."""

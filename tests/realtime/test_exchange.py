@@ -23,6 +23,14 @@ from duio_mesh.spec import NodeSpec
 RUN, SIZE = "run", 3
 
 
+class Process(str):
+    """A process by its name, which is all that matters here."""
+
+    @property
+    def who(self) -> str:
+        return str(self)
+
+
 class Sample:
     """What Zenoh hands to a subscriber."""
 
@@ -122,10 +130,10 @@ def test_a_neighbour_that_is_gone_a_frame_that_was_dropped_and_one_that_is_far_b
     node = Node(wait=30.0)
     node.first()
     node.network.frame(2, 2)  # newer than the frame that is due: that one was dropped on the way
-    node.realtime.noticed("node-3", alive=False)
+    node.realtime.noticed(Process("node-3"), alive=False)
     assert node.step(1) == [{}]
     assert node.step(2) == [{2: 202.0}]
-    node.realtime.noticed("node-3", alive=True)  # its newest frame is of step 0
+    node.realtime.noticed(Process("node-3"), alive=True)  # its newest frame is of step 0
     node.network.frame(2, 3)  # and two deadlines have passed without any
     assert node.step(3) == [{2: 302.0}]
     threading.Timer(0.05, lambda: [node.network.frame(3, k) for k in (1, 2, 3, 4)]).start()
@@ -176,7 +184,7 @@ def test_a_plant_that_is_lost_or_silent_ends_the_node() -> None:
     with pytest.raises(RunError, match=r"waited 0.2 s on plant -> 1 for step 0: it sent nothing yet"):
         node.realtime.sample(0, 0, 2)
     node.network.sample(0)
-    node.realtime.noticed("plant", alive=False)
+    node.realtime.noticed(Process("plant"), alive=False)
     assert node.realtime.sample(0, 0, 2).tolist() == [0.0, 0.0]  # what it sent before it went still counts
     with pytest.raises(RunError, match=r"lost plant while waiting on plant -> 1 for step 1"):
         node.realtime.sample(1, 0, 2)

@@ -107,7 +107,7 @@ def test_the_others_go_on_without_a_node_that_is_stopped_and_it_catches_up() -> 
         code = stopped.end()
     assert code in (0, 1), stopped.stderr
     assert "Traceback" not in stopped.stderr
-    assert "realtime: 60 ticks of 0.06 s, 3.6 s in all" in stopped.stderr
+    assert "realtime: 60 ticks of 0.06 s, about 3.6 s in all" in stopped.stderr
     metrics = stopped.metrics()
     trace = np.load(stopped.out / "trace.npz")
     assert metrics["steps"] == 60

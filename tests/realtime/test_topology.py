@@ -9,6 +9,8 @@ import pytest
 import duio_mesh
 from duio_mesh.report.timeliness import in_words, untimely
 from duio_mesh.scenario.model import LOCKSTEP, Timing
+from duio_mesh.scenario.problems import Problems
+from duio_mesh.scenario.timing import read_timing
 from tests.conftest import TOPOLOGIES
 from tests.scenario.broken import VALID
 from tests.scenario.stand_in import load
@@ -27,6 +29,13 @@ def test_timing_is_read_in_seconds(topology: Path) -> None:
     assert load(topology, "timing={mode: realtime, tick: 0.02, wait: 0.9}").timing.wait == pytest.approx(0.018)
 
 
+def test_nobody_comes_back_in_real_time() -> None:
+    for policy, refused in (("restart", True), ("degrade", False), ("stop", False)):
+        problems = Problems()
+        read_timing({"timing": {"mode": "realtime", "tick": 0.1}}, None, {"on_node_loss": policy}, problems)
+        assert bool(problems) == refused
+
+
 def test_a_design_for_the_clock_has_the_same_gains_and_knows_what_to_do_without_a_neighbour() -> None:
     file, timing = TOPOLOGIES / "ring.yaml", {"mode": "realtime", "tick": 2.0}
     still = duio_mesh.synthesise(duio_mesh.load_scenario(file))
@@ -41,8 +50,11 @@ def test_a_design_for_the_clock_has_the_same_gains_and_knows_what_to_do_without_
 
 def test_how_long_it_will_take_is_said_beforehand() -> None:
     assert in_words(LOCKSTEP, 100, processes=True) == ""
-    assert in_words(Timing("realtime", 0.02, 0.01), 100, processes=True) == "realtime: 100 ticks of 0.02 s, 2 s in all"
-    assert in_words(Timing("realtime", 60.0, 30.0), 101, processes=True).endswith("101 min in all")
+    assert (
+        in_words(Timing("realtime", 0.02, 0.01), 100, processes=True)
+        == "realtime: 100 ticks of 0.02 s, about 2 s in all"
+    )
+    assert in_words(Timing("realtime", 60.0, 30.0), 101, processes=True).endswith("about 101 min in all")
     assert in_words(Timing("realtime", 60.0, 30.0), 480, processes=True).endswith("8 h in all")
 
 

@@ -487,6 +487,10 @@ FAULTS = [
     faulty("kill nobody", "{nodes: [{node: §3, kill: 5}]}",
            "faults.nodes.0.node: no such node: 3; the nodes are 1 and 2"),
     faulty("kill and pause", "{nodes: [{node: 1, kill: 5, §pause: 6}]}", "give either kill or pause, not both"),
+    faulty("restart without leave", "{nodes: [{node: 1, restart: §5}]}", "needs run.on_node_loss: restart (it is stop)"),
+    faulty("away without a restart", "{nodes: [{node: 1, kill: 5, §away: 6}]}", "belongs to restart"),
+    faulty("killed twice", "{nodes: [{node: 1, kill: 5}, {node: 1, kill: §6}]}",
+           "node 1 is not there: it is gone from step 5 for good"),
     faulty("pause for how long", "{nodes: [§{node: 1, pause: 5}]}", "pause and seconds belong together"),
     faulty("faulty seed", "{seed: §-1}", "faults.seed: should be at least 0, not -1"),
 ]

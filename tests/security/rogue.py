@@ -16,7 +16,7 @@ import pytest
 import zenoh
 
 import duio_mesh
-from duio_mesh import node
+from duio_mesh import links, node
 from duio_mesh.launcher import Launch
 from duio_mesh.mesh import Encoder, Keys, Mesh, security
 from duio_mesh.run_folder import RunFolder
@@ -99,8 +99,8 @@ def besiege(
             super().__init__(wire, who, *rest)
             meshes.append(self)
 
-    make = node.make_observer
-    monkeypatch.setattr(node, "make_observer", lambda spec: Gate(make(spec), reached, go_on))
+    make = links.make_observer
+    monkeypatch.setattr(links, "make_observer", lambda spec: Gate(make(spec), reached, go_on))
     monkeypatch.setattr(node, "Mesh", Bad)
     # our own side of the access control is ours to switch off
     monkeypatch.setattr(security, "access", lambda keys, guard: {"enabled": False})
