@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 
 class DuioError(Exception):
     """Anything that duio_mesh itself refuses or reports; the text is meant for the user."""
@@ -20,4 +22,11 @@ class DesignError(DuioError):
 
 
 class RunError(DuioError):
-    """A run that started has failed (exit 3): the message names the process, or the edge, step and round."""
+    """A run that started has failed (exit 3): the message names the process, or the edge, step and round.
+
+    ``lost``: processes whose own end was the cause, and may say more.
+    """
+
+    def __init__(self, text: str, lost: Sequence[str] = ()) -> None:
+        super().__init__(text)
+        self.lost = tuple(lost)

@@ -73,7 +73,7 @@ class Credits:
         while late := missing():
             lost = [self._sources[i].who for i in late if self._sources[i].gone]
             if lost and not self._mesh.pending():
-                raise RunError(f"the plant lost {', '.join(lost)} before step {steps}")
+                raise RunError(f"the plant lost {', '.join(lost)} before step {steps}", lost)
             try:
                 self._take(soon(self._spec.deadline))
                 heard = time.monotonic()

@@ -73,7 +73,7 @@ def live(kind: type[Spec], run: Callable[[Spec, Report], None], path: Path, repo
         report("stopped")
         return STOPPED
     except (DuioError, ValueError, OSError) as e:
-        report("failed", text=str(e))
+        report("failed", text=str(e), lost=getattr(e, "lost", ()))
         return FAILED
     except Exception as e:
         report("failed", text=f"{type(e).__name__}: {e}", traceback=traceback.format_exc()[-2000:])

@@ -14,7 +14,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self, TypeAlias
@@ -42,7 +42,8 @@ class Process:
         self.who = who
         self.said: dict[str, Any] = {}  # what it reported when it was ready
         self.done: dict[str, Any] = {}  # its last words when all went well
-        self.failure = ""  # what it says went wrong
+        self.failure = ""  # what it says went wrong ...
+        self.lost: Sequence[str] = ()  # ... and whose end was the cause
         self.code: int | None = None  # exit code; negative is a signal
         self.warnings: list[str] = []
         self.pid = 0
@@ -157,6 +158,7 @@ class Supervisor:
                     since = time.monotonic()
             if any(p.code or (p.failure and not self._recovers(p, recover)) for p in self._essential()):
                 self._until(lambda: False, GATHER)
+                self._until(lambda: not self._owing(), END)
                 raise RunError(self._diagnosis())
             if self.source_done():
                 self._end_the_late()
@@ -203,7 +205,7 @@ class Supervisor:
         found: dict[str, Process] = {}
         for p in self._essential():
             for who in p.waits.get("on", ()):
-                other = self.processes.get(who) or self.processes["gateway"]  # which is the plant to everybody
+                other = self._named(who)
                 if other.there and (not other.waits or other.state()):
                     found[who] = other
         return list(found.values())
@@ -246,12 +248,22 @@ class Supervisor:
     def _essential(self) -> list[Process]:
         return [p for p in self.processes.values() if p.essential and p.there]
 
+    def _owing(self) -> list[Process]:
+        """Processes that others have lost and that have not said yet why they ended."""
+        named = {who for p in self._essential() for who in p.lost}
+        return [p for p in map(self._named, sorted(named)) if not p.failure and p.code is None]
+
+    def _named(self, who: str) -> Process:
+        """A process as the others call it: a gateway is the plant to them."""
+        return self.processes.get(who) or self.processes["gateway"]
+
     def _diagnosis(self) -> str:
         """Who was the first cause: a killed process before one that failed by itself, before one that lost a peer."""
         killed = [p.death() for p in self._essential() if p.code and p.code < 0]
         failed = [p.failure for p in self._essential() if p.failure]
+        first = [p.failure for p in self._essential() if p.failure and not p.lost]
         stopped = [f"{p.who} is {p.state()}" for p in self._roots() if p.state()]
-        return "; ".join(killed + failed + stopped) or "; ".join(p.death() for p in self._essential() if p.code)
+        return "; ".join(killed + first + [text for text in failed if text not in first] + stopped) or "; ".join(p.death() for p in self._essential() if p.code)
 
     def _until(self, done: Callable[[], bool], timeout: float) -> None:
         end = time.monotonic() + timeout
@@ -286,7 +298,7 @@ class Supervisor:
         elif what == "done":
             process.done = event
         elif what == "failed":
-            process.failure = event["text"]
+            process.failure, process.lost = event["text"], event.get("lost", ())
         elif what == "sensors":
             self.note = event["text"]
         elif what == "warning":

@@ -183,7 +183,9 @@ class Lockstep:
         """A knock: of this wait, or of one that has ended well meanwhile."""
         if line.gone or line.late is self._at:
             self._at = None
-            raise (LinkLost if line.gone else RunError)(self._why(line, k, r))
+            if line.gone:
+                raise LinkLost(self._why(line, k, r), (line.who,))
+            raise RunError(self._why(line, k, r))
 
     def _held(self, line: Line, k: int, r: int, size: int) -> Array | None:
         """The frame of step k, round r, if it came before it was due and has the right size."""

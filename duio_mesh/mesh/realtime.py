@@ -137,7 +137,9 @@ class Realtime:
         end, plant = time.monotonic() + self._patience, self._plant
         while (k, r) not in plant.waiting:
             if plant.gone and not len(self._inbox):
-                raise RunError(f"{self._mesh.who} lost {plant.who} while waiting on {plant.name} for step {k}")
+                raise RunError(
+                    f"{self._mesh.who} lost {plant.who} while waiting on {plant.name} for step {k}", (plant.who,)
+                )
             if not self._take(end - time.monotonic()):
                 raise RunError(
                     f"{self._mesh.who} waited {self._patience:g} s on {plant.name} for step {k}: {plant.doing()}"
