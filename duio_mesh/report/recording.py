@@ -64,7 +64,7 @@ class Recording:
         self._states = {source: Buffer(paths[source], enough, self._scalars) for source in paths}
 
         self.event(f"{len(entities.ids)} nodes, {spec.n} states, {spec.steps} steps of {spec.step:g} s")
-        self._conditions = Conditions(entities, self._send, self.event, self._reached)
+        self._conditions = Conditions(entities, self._send, self.event, self._given)
         self._gaps = Gaps(entities, self._scalars) if spec.tick else None
         self._flags = Flags(entities, self._send) if spec.flags else None
 
@@ -241,8 +241,11 @@ class Recording:
 
     def _reached(self, who: str) -> int:
         """The step after the last that a process has given."""
-        seen = self._seen[None if who == "plant" else int(who.removeprefix("node-"))]
-        return max((last for _, last in seen), default=0)
+        return max((last for _, last in self._given(who)), default=0)
+
+    def _given(self, who: str) -> Spans:
+        """The steps of which a process has given rows."""
+        return self._seen[None if who == "plant" else int(who.removeprefix("node-"))]
 
     def _break_lines(self) -> None:
         """A NaN at the start of every gap between two rows: a viewer would join the rows with a line. Lanes end too."""
