@@ -22,7 +22,7 @@ from duio_mesh.report.pairing import Decimator, Errors, Middle, Pairing, Span, S
 from duio_mesh.report.streams import Batch, FileStream, LiveStream, Opening
 from duio_mesh.spec import RecorderSpec
 
-SENDS = 20  # of one series in a whole run: each leaves some kB with Rerun until the file is closed ...
+SENDS = 10  # of one series in a whole run: each leaves some kB with Rerun until the file is closed ...
 LIVE_SENDS = 100  # ... where somebody may watch: a viewer is behind by one percent of the plot's width at most
 RATES = 16  # of one process that are sent at once where nobody watches
 CHUNKS = 8_000  # sends of a whole run, all series: each costs 50 microseconds and 2 kB whatever is in it
