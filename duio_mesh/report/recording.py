@@ -20,6 +20,7 @@ from duio_mesh.report.flags import Flags
 from duio_mesh.report.gaps import Gaps
 from duio_mesh.report.pairing import Decimator, Errors, Middle, Pairing, Span, Spans, log_norms, runs
 from duio_mesh.report.streams import Batch, FileStream, LiveStream, Opening
+from duio_mesh.report.worst import Worst
 from duio_mesh.spec import RecorderSpec
 
 SENDS = 10  # of one series in a whole run: each leaves some kB with Rerun until the file is closed ...
@@ -48,6 +49,8 @@ class Recording:
         self._file = FileStream(Path(spec.recording), opening)
         self._live = LiveStream(opening) if spec.live else None
         self._closed, self._watched = False, set[int]()
+        self._worst = Worst(entities.ids, spec.steps)
+        self._has_rates = rates
         self._rates = dict[str, Buffer]()
 
         self._middle = Middle(spec.n, entities.ids, spec.steps) if spec.outside else None
@@ -205,6 +208,9 @@ class Recording:
             self.event(f"{self.dropped} batches were too much for a live viewer; this file has them", "INFO")
         for buffer in self._buffers():
             buffer.flush(everything=True)
+        if len(self._entities.ids) > look.LINES:
+            worst = self._worst.nodes(look.LINES)
+            self._file.lay_out(look.blueprint(self._entities, rates=self._has_rates, worst=worst))
         try:
             self._file.close()
         finally:
@@ -236,6 +242,7 @@ class Recording:
         self._seen[source].add(k, k + len(rows))
 
     def _say(self, errors: Errors) -> None:
+        self._worst.see(errors)
         steps, values = self._thinned[errors.node].push(errors.steps, errors.log10)
         self._errors[errors.node].add(*_column(steps, values))
 
