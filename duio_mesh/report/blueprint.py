@@ -197,13 +197,11 @@ def _rounds(entities: Entities) -> list[rrb.Container]:
 
 def _run(entities: Entities, rates: bool) -> rrb.Container:
     document = rrb.TextDocumentView(origin=DESCRIPTION, name="What was run")
-    if not rates:
-        return rrb.Horizontal(document, name="Run")
     legend = len(entities.ids) < LEGEND
-    plots = [_plot("Steps per second", [f"{RATES}/**"], legend=legend)]
+    plots = [_plot("Steps per second", [f"{RATES}/**"], legend=legend)] if rates else []
     if entities.spec.tick:
         plots.append(_plot("Neighbours that a node went on without", [f"{GAPS}/**"], legend=legend))
-    return rrb.Horizontal(rrb.Vertical(*plots), document, name="Run")
+    return rrb.Horizontal(*([rrb.Vertical(*plots)] if plots else []), document, name="Run")
 
 
 def _plot(name: str, contents: list[str], *, legend: bool, axis: rrb.TimeAxis | None = None) -> rrb.View:
