@@ -145,13 +145,13 @@ def _estimates(entities: Entities, worst: Sequence[int]) -> rrb.Container:
     errors = []
     if worst:
         name = f"The {len(chosen)} worst nodes"
-        errors.append(_plot(f"{name}: log10 ‖x̂ − x‖", [entities.error(i) for i in chosen], legend=True))
+        errors.append(_plot(f"{name}: log10 ‖x̂ − x‖", [entities.error(i) for i in chosen], legend=len(chosen) <= LEGEND))
 
     def grid(nodes: Iterable[int], name: str) -> rrb.Container:
         views = list(errors)
         for c in states:
             paths = [f"{entities.state(c)}/actual", *(f"{entities.state(c)}/{entities.name(i)}" for i in nodes)]
-            views.append(_plot(f"x{c + 1}", paths, legend=not errors and c == states[0] and len(paths) <= LEGEND))
+            views.append(_plot(f"x{c + 1}", paths, legend=c == states[0] and len(paths) <= LEGEND))
         return rrb.Grid(*views, name=name)
 
     return rrb.Tabs(
