@@ -35,6 +35,7 @@ examples:
   python launch.py topologies/six_state_ring.yaml --check
   python launch.py replay runs/heat-ring/latest --node 3   (one node again, alone, from its inputs; replay --help)
   python launch.py new heat --rooms 8x8 --nodes 16 --out topologies/heat8x8.yaml   (new --help: write a topology file)
+  python launch.py export runs/site --compose   (export --help: containers on many hosts; gather --help: their results)
 """
 
 

@@ -20,7 +20,7 @@ import numpy as np
 
 from duio_mesh.arrays import Array
 from duio_mesh.errors import RunError
-from duio_mesh.journal import aside, map_rows
+from duio_mesh.journal import aside, map_rows, missing
 from duio_mesh.observers.watch import COLUMNS
 from duio_mesh.simulation import Trace, estimate_sizes, split_trace
 from duio_mesh.synthesis.design import Design
@@ -83,7 +83,8 @@ class RunFolder:
         steps = max(map(len, rows.values()))
         watched = {i: np.array(map_rows(aside(self.rows(f"node-{i}")), COLUMNS)) for i in sizes}
         trace = split_trace(design, _padded(x, steps), {i: _padded(r, steps) for i, r in rows.items()}, watched)
-        return replace(trace, samples=self._samples(design, steps))
+        gaps = {i: np.array(map_rows(missing(self.rows(f"node-{i}")), 1)[:, 0]) for i in sizes if design.plant.tick}
+        return replace(trace, samples=self._samples(design, steps), missing=gaps)
 
     def _samples(self, design: Design, steps: int) -> dict[int, Array]:
         """What a gateway handed on to every node; {} when the plant was simulated."""

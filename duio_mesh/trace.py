@@ -22,6 +22,8 @@ class Trace:
     vhat: dict[int, Array] = field(default_factory=dict)  # node id -> (K, r) where it reconstructs its noise
     rounds: dict[int, Array] = field(default_factory=dict)
     """Node id -> (m, 3) [round, residual, disagreement] of a watched step; for the recording, not in trace.npz."""
+    missing: dict[int, Array] = field(default_factory=dict)
+    """Node id -> (m,) how many neighbours it went on without, in real time; for the recording, not in trace.npz."""
     samples: dict[int, Array] = field(default_factory=dict)
     """Node id -> (K, p + m) [y_i; u_i] as they came from outside; {} when the plant was simulated."""
     flagged: NDArray[np.bool_] | None = None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -21,9 +21,12 @@ LABEL = 0xE6EDF3FF
 NODE, RING, EDGE = 0.16, 0.23, 0.035  # radii in the topology view, where neighbours are about 1 apart
 
 
-def blueprint(entities: Entities, *, rates: bool) -> rrb.Blueprint:
-    """Tabs: overview, estimates, what else is reconstructed, the run. ``rates``: whether the recording has any."""
-    tabs = [_overview(entities), _estimates(entities), *_reconstruction(entities), *_rounds(entities)]
+def blueprint(entities: Entities, *, rates: bool, worst: Sequence[int] = ()) -> rrb.Blueprint:
+    """Tabs: overview, estimates, what else is reconstructed, the run. ``rates``: whether the recording has any.
+
+    Where there are more nodes than ``LINES``, only some of their estimates are shown: ``worst``, once that is known.
+    """
+    tabs = [_overview(entities), _estimates(entities, worst), *_reconstruction(entities), *_rounds(entities)]
     tabs.append(_run(entities, rates))
     return rrb.Blueprint(
         rrb.Tabs(*tabs, active_tab=0),
@@ -134,20 +137,25 @@ def _topology(entities: Entities) -> rrb.View:
     )
 
 
-def _estimates(entities: Entities) -> rrb.Container:
-    """One tab with all nodes, and one per node; a view per state."""
+def _estimates(entities: Entities, worst: Sequence[int]) -> rrb.Container:
+    """One tab with all nodes, and one per node; a view per state. Of many nodes the worst, and their errors first."""
     states = spread(entities.shown, VIEWS)
-    chosen = spread(entities.ids, LINES)
+    chosen = tuple(worst) or spread(entities.ids, LINES)
+    name = "All nodes" if len(chosen) == len(entities.ids) else f"{len(chosen)} nodes"
+    errors = []
+    if worst:
+        name = f"The {len(chosen)} worst nodes"
+        errors.append(_plot(f"{name}: log10 ‖x̂ − x‖", [entities.error(i) for i in chosen], legend=len(chosen) <= LEGEND))
 
     def grid(nodes: Iterable[int], name: str) -> rrb.Container:
-        views = []
+        views = list(errors)
         for c in states:
             paths = [f"{entities.state(c)}/actual", *(f"{entities.state(c)}/{entities.name(i)}" for i in nodes)]
             views.append(_plot(f"x{c + 1}", paths, legend=c == states[0] and len(paths) <= LEGEND))
         return rrb.Grid(*views, name=name)
 
     return rrb.Tabs(
-        grid(chosen, "All nodes" if len(chosen) == len(entities.ids) else f"{len(chosen)} nodes"),
+        grid(chosen, name),
         *(grid([i], f"Node {i}") for i in chosen if len(entities.ids) > 1),
         active_tab=0,
         name="Estimates",
@@ -189,13 +197,11 @@ def _rounds(entities: Entities) -> list[rrb.Container]:
 
 def _run(entities: Entities, rates: bool) -> rrb.Container:
     document = rrb.TextDocumentView(origin=DESCRIPTION, name="What was run")
-    if not rates:
-        return rrb.Horizontal(document, name="Run")
     legend = len(entities.ids) < LEGEND
-    plots = [_plot("Steps per second", [f"{RATES}/**"], legend=legend)]
+    plots = [_plot("Steps per second", [f"{RATES}/**"], legend=legend)] if rates else []
     if entities.spec.tick:
         plots.append(_plot("Neighbours that a node went on without", [f"{GAPS}/**"], legend=legend))
-    return rrb.Horizontal(rrb.Vertical(*plots), document, name="Run")
+    return rrb.Horizontal(*([rrb.Vertical(*plots)] if plots else []), document, name="Run")
 
 
 def _plot(name: str, contents: list[str], *, legend: bool, axis: rrb.TimeAxis | None = None) -> rrb.View:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from duio_mesh.arrays import Array
 
-ROWS = 8192  # of one entity that are sent at once at most
+ROWS = 1 << 15  # of one entity that are sent at once at most
 
 
 class Buffer:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from itertools import pairwise
 from typing import Any
 
 from duio_mesh.report import blueprint as look
 from duio_mesh.report.entities import STATES, Entities
+from duio_mesh.report.pairing import Spans
 
 LEVELS = {"up": "INFO", "late": "WARN", "down": "ERROR"}
 
@@ -19,15 +21,17 @@ class Conditions:
         entities: Entities,
         send: Callable[[str, Sequence[int], Any], None],
         event: Callable[[str, str, int], None],
-        reached: Callable[[str], int],
+        seen: Callable[[str], Spans],
     ) -> None:
         """``send(path, steps, columns)`` and ``event(text, level, step)`` write into the recording.
 
-        ``reached(who)`` is the step after the last that a process has given.
+        ``seen(who)`` are the steps of which a process has given rows.
         """
-        self._entities, self._send, self._event, self._reached = entities, send, event, reached
+        self._entities, self._send, self._event, self._seen = entities, send, event, seen
         self._alive: dict[str, str] = {}
         self._leaving: dict[str, tuple[int, int]] = {}  # who -> (down from which step, how far it was at the last look)
+        self._back: dict[str, int] = {}  # who has come back -> from about which step on
+        self._told_of: dict[str, int] = {}  # who -> the step after its last gap that was told
         self._told: dict[tuple[int, int], str] = {}  # arc -> what was last said of it
         self._drawn: dict[tuple[int, int], str] = {}  # edge -> how it is drawn
         for i in entities.ids:
@@ -36,25 +40,33 @@ class Conditions:
             self._draw(edge, 0)
 
     def process(self, who: str, state: str, k: int) -> None:
-        """``who`` (plant, node-3) is ``state`` from step k on; down is believed later, by ``settle``."""
+        """``who`` (plant, node-3) is ``state`` from step k on; down is believed later, by ``settle``.
+
+        Everybody is up from the first step on; news of it may come late. News that somebody is gone and back may come
+        late too, or ahead of the rows: when that was the gap between the rows says.
+        """
         if state == "down":
             self._leaving[who] = (k, -1)
-            return
-        if who in self._leaving:  # gone and back before anybody could tell
-            self._gone(who)
-        self._change(who, state, k)
+        elif state == "up" and (who in self._leaving or self._alive.get(who) == "down"):
+            self._back[who] = k
+        else:
+            self._change(who, state, 0 if state == "up" and who not in self._alive else k)
 
     def settle(self, *, final: bool = False) -> None:
         """Call down who has gone and has given nothing between two calls; ``final``: all who have gone.
 
         A process that gave its last step has done its work; its last rows may come after the news that it went.
         """
+        self._tell_gaps(final=final)
         for who, (k, reached) in list(self._leaving.items()):
             now = self._reached(who)
-            if final or now == reached:
+            if final or (now == reached and who not in self._back):
                 self._gone(who)
             else:
                 self._leaving[who] = (k, now)
+        for who, k in list(self._back.items()) if final else ():  # there and back without a row since
+            self._change(who, "up", k)
+            del self._back[who]
 
     def arc(self, i: int, j: int, state: str, k: int) -> None:
         """The arc on which i tells j is ``state`` from step k on. Raises KeyError when there is none."""
@@ -67,8 +79,28 @@ class Conditions:
 
     def _gone(self, who: str) -> None:
         k, _ = self._leaving.pop(who)
-        if self._reached(who) < self._entities.spec.steps:
-            self._change(who, "down", k)
+        reached = self._reached(who)
+        if reached < self._entities.spec.steps:
+            self._change(who, "down", max(k, reached))
+
+    def _reached(self, who: str) -> int:
+        """The step after the last that a process has given."""
+        return max((last for _, last in self._seen(who)), default=0)
+
+    def _tell_gaps(self, *, final: bool) -> None:
+        """Say of those who have come back from when to when they were away: before ``final``, one gap of each."""
+        changes = []
+        for who in list(self._back):
+            gaps = [(a, b) for (_, a), (b, _) in pairwise(self._seen(who)) if b > self._told_of.get(who, 0)]
+            for a, b in gaps if final else gaps[:1]:
+                changes += [(a, who, "down"), (b, who, "up")]
+                self._told_of[who] = b
+            if gaps:
+                del self._back[who]
+                if self._leaving.get(who, (0, 0))[0] < self._told_of[who]:  # that was this gap, and nothing newer
+                    self._leaving.pop(who, None)
+        for k, who, state in sorted(changes, key=lambda change: change[0]):  # edges look at both their ends
+            self._change(who, state, k)
 
     def _change(self, who: str, state: str, k: int) -> None:
         before = self._alive.get(who)

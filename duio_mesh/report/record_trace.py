@@ -41,6 +41,7 @@ def record_trace(path: Path, scenario: Scenario, trace: Trace, description: str 
         unknown_inputs=q,
         flags=trace.flagged is not None,
         watch_step=getattr(scenario.options, "watch_step", None),
+        tick=scenario.timing.tick if trace.missing else 0.0,
         outside=scenario.outside is not None,
     )
     try:
@@ -49,6 +50,8 @@ def record_trace(path: Path, scenario: Scenario, trace: Trace, description: str 
             recording.fill(trace.x, rows)
             for i, figures in trace.rounds.items():
                 recording.rounds(i, figures)
+            for i, counts in trace.missing.items():
+                recording.missing_neighbours(i, 0, counts)
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)

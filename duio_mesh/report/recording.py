@@ -20,9 +20,10 @@ from duio_mesh.report.flags import Flags
 from duio_mesh.report.gaps import Gaps
 from duio_mesh.report.pairing import Decimator, Errors, Middle, Pairing, Span, Spans, log_norms, runs
 from duio_mesh.report.streams import Batch, FileStream, LiveStream, Opening
+from duio_mesh.report.worst import Worst
 from duio_mesh.spec import RecorderSpec
 
-SENDS = 20  # of one series in a whole run: each leaves some kB with Rerun until the file is closed ...
+SENDS = 10  # of one series in a whole run: each leaves some kB with Rerun until the file is closed ...
 LIVE_SENDS = 100  # ... where somebody may watch: a viewer is behind by one percent of the plot's width at most
 RATES = 16  # of one process that are sent at once where nobody watches
 CHUNKS = 8_000  # sends of a whole run, all series: each costs 50 microseconds and 2 kB whatever is in it
@@ -48,6 +49,8 @@ class Recording:
         self._file = FileStream(Path(spec.recording), opening)
         self._live = LiveStream(opening) if spec.live else None
         self._closed, self._watched = False, set[int]()
+        self._worst = Worst(entities.ids, spec.steps)
+        self._has_rates = rates
         self._rates = dict[str, Buffer]()
 
         self._middle = Middle(spec.n, entities.ids, spec.steps) if spec.outside else None
@@ -64,7 +67,7 @@ class Recording:
         self._states = {source: Buffer(paths[source], enough, self._scalars) for source in paths}
 
         self.event(f"{len(entities.ids)} nodes, {spec.n} states, {spec.steps} steps of {spec.step:g} s")
-        self._conditions = Conditions(entities, self._send, self.event, self._reached)
+        self._conditions = Conditions(entities, self._send, self.event, self._given)
         self._gaps = Gaps(entities, self._scalars) if spec.tick else None
         self._flags = Flags(entities, self._send) if spec.flags else None
 
@@ -205,6 +208,9 @@ class Recording:
             self.event(f"{self.dropped} batches were too much for a live viewer; this file has them", "INFO")
         for buffer in self._buffers():
             buffer.flush(everything=True)
+        if len(self._entities.ids) > look.LINES:
+            worst = self._worst.nodes(look.LINES)
+            self._file.lay_out(look.blueprint(self._entities, rates=self._has_rates, worst=worst))
         try:
             self._file.close()
         finally:
@@ -236,13 +242,17 @@ class Recording:
         self._seen[source].add(k, k + len(rows))
 
     def _say(self, errors: Errors) -> None:
+        self._worst.see(errors)
         steps, values = self._thinned[errors.node].push(errors.steps, errors.log10)
         self._errors[errors.node].add(*_column(steps, values))
 
     def _reached(self, who: str) -> int:
         """The step after the last that a process has given."""
-        seen = self._seen[None if who == "plant" else int(who.removeprefix("node-"))]
-        return max((last for _, last in seen), default=0)
+        return max((last for _, last in self._given(who)), default=0)
+
+    def _given(self, who: str) -> Spans:
+        """The steps of which a process has given rows."""
+        return self._seen[None if who == "plant" else int(who.removeprefix("node-"))]
 
     def _break_lines(self) -> None:
         """A NaN at the start of every gap between two rows: a viewer would join the rows with a line. Lanes end too."""

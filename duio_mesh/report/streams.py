@@ -111,6 +111,11 @@ class FileStream:
             raise OSError(f"{self._path} is incomplete: {e}") from None
         self._unwritten = False
 
+    def lay_out(self, blueprint: Any) -> None:
+        """Replace the layout."""
+        self._unwritten = True
+        self._stream.send_blueprint(blueprint)
+
     def close(self) -> None:
         """Write what is left, and the footer. Raises OSError when that is impossible (a full disk)."""
         try:

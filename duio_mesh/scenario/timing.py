@@ -32,8 +32,8 @@ def read_timing(
     if run.get("on_node_loss") == "restart":
         problems.at(
             ("run", "on_node_loss"),
-            "cannot be restart under timing: realtime: who comes back joins at an agreed step, for which the others would "
-            "have to wait; choose stop or degrade",
+            "cannot be restart under timing: realtime: who comes back joins at an agreed step, for which the others "
+            "would have to wait; choose stop or degrade",
         )
     tick = timing.tick
     if tick is None and plant is not None:

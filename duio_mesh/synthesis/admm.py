@@ -54,9 +54,13 @@ def design(scenario: Scenario, progress: Progress) -> Design:
         progress(f"fusion of nodes {list(ids)}")
         eigenvalues = check_joint(ids, nodes, stability)
         island = island_of(scenario, ids, nodes)
-        radius = _converges(island, options)
+
+        def say(what: str, at: tuple[int, ...] = ids) -> None:
+            progress(f"fusion of {len(at)} nodes from {at[0]}: {what}")
+
+        radius = _converges(island, options, say)
         gains = noise_gain((nodes[i] for i in ids), fused_maps(island, options))
-        described.append(island_facts(island, options, eigenvalues, radius, gains))
+        described.append(island_facts(island, options, eigenvalues, radius, gains, say))
         islands |= dict.fromkeys(ids, island)
     specs = {i: _spec(scenario, i, local, islands[i]) for i, local in nodes.items()}
     return Design(scenario, plant_spec(scenario), specs, _certificate(options, nodes, islands, described))
@@ -76,7 +80,7 @@ def island_of(scenario: Scenario, ids: tuple[int, ...], nodes: Mapping[int, Loca
     return Island(ids, T, L, H, np.asarray(np.linalg.inv(H)))
 
 
-def _converges(island: Island, options: Options) -> float:
+def _converges(island: Island, options: Options, say: Progress) -> float:
     """The fusion's spectral radius."""
     if options.fusion == "finite_time":
         *_, last = iterates(island, options)
@@ -85,7 +89,7 @@ def _converges(island: Island, options: Options) -> float:
                 f"finite_time loses too many digits on nodes {list(island.ids)}: {len(spectrum(island.L))} rounds end "
                 f"{worst_error(last):.1e} beside the exact mean; use fusion: admm or relaxed on this graph"
             )
-    radius = fusion_radius(island, options)
+    radius = fusion_radius(island, options, say)
     if radius >= 1:
         raise DesignError(
             f"the fusion of nodes {list(island.ids)} does not converge: spectral radius {radius:.6f}; "

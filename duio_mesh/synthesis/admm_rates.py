@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from itertools import islice
 from typing import Any, NamedTuple
 
@@ -11,9 +11,9 @@ from scipy import linalg
 
 from duio_mesh.arrays import Array
 from duio_mesh.geometry import complement
-from duio_mesh.geometry.stability import spectral_radius
 from duio_mesh.observers.fusion import fusion_rounds, step_size
 from duio_mesh.synthesis.admm_options import Options
+from duio_mesh.synthesis.stacked import Say, largest_modulus
 
 
 class Island(NamedTuple):
@@ -66,7 +66,7 @@ def iterates(island: Island, options: Options) -> Iterator[Array]:
 
 def _spread(L: Array, X: Array) -> Array:
     """(L kron I) X."""
-    return (L @ X.reshape(len(X), -1)).reshape(X.shape)
+    return np.asarray(L @ X.reshape(len(X), -1)).reshape(len(L), *X.shape[1:])
 
 
 def _admm(island: Island, options: Options) -> Iterator[Array]:
@@ -108,11 +108,16 @@ def worst_error(X: Array) -> float:
     return float(np.linalg.norm(X - np.eye(X.shape[1]), 2, axis=(1, 2)).max())
 
 
-def predicted_errors(island: Island, options: Options, rounds: int) -> dict[int, float]:
+def predicted_errors(island: Island, options: Options, rounds: int, say: Say = lambda _: None) -> dict[int, float]:
     """``worst_error`` after some numbers of exchanges, among them ``rounds``."""
     wanted = sorted({0, 1, 2, 5, 10, 20, 30, 40, 50, 60, 80, 100, 200, 500, 1000, 3000, 10000, rounds})
-    kept = [k for k in wanted if k <= rounds]
-    return {k: worst_error(X) for k, X in enumerate(islice(iterates(island, options), rounds + 1)) if k in set(kept)}
+    found = {}
+    for k, X in enumerate(islice(iterates(island, options), rounds + 1)):
+        if k % 50 == 0:
+            say(f"predicted error, round {k} of {rounds}")
+        if k in wanted:
+            found[k] = worst_error(X)
+    return found
 
 
 def fused_maps(island: Island, options: Options) -> Array:
@@ -130,13 +135,39 @@ def fused_maps(island: Island, options: Options) -> Array:
     return np.asarray(end).reshape(N, n, -1)
 
 
-def fusion_radius(island: Island, options: Options) -> float:
-    """Spectral radius of the fusion's error from round to round; 0 for finite_time, which is exact after its rounds."""
+def fusion_radius(island: Island, options: Options, say: Say = lambda _: None) -> float:
+    """Spectral radius of the fusion's error from round to round; 0 for finite_time, which is exact after its rounds.
+
+    Up to stacked.DENSE rows from all eigenvalues, beyond that by Arnoldi's method from products with blocks.
+    """
     if options.fusion == "finite_time":
         return 0.0
+    N, n = len(island.T), len(island.H)
     if options.fusion == "relaxed":
-        return spectral_radius(relaxed_matrix(island, options.c, island.degrees))
-    return spectral_radius(admm_matrix(island, options, island.step_sizes(options)))
+        solve, adjacency = _relaxed_solve(island, options.c), np.diag(island.degrees) - island.L
+
+        def relaxed(X: Array) -> Array:
+            return (options.c * solve @ _spread(adjacency, X.reshape(N, n, -1))).reshape(X.shape)
+
+        return largest_modulus(N * n, relaxed, lambda: relaxed_matrix(island, options.c, island.degrees), say)
+    steps = island.step_sizes(options)
+    times = admm_product(island, options, steps)
+    return largest_modulus((2 * N - 1) * n, times, lambda: admm_matrix(island, options, steps), say)
+
+
+def admm_product(island: Island, options: Options, steps: Array) -> Callable[[Array], Array]:
+    """Products with ``admm_matrix``, block by block: ((2N - 1) n, k) -> the same."""
+    N, n = len(island.T), len(island.H)
+    Q = complement(np.ones((N, 1)) / np.sqrt(N))
+    M, alpha, half = island.curvatures(options.normalised), steps[:, None, None], options.gamma / 2
+
+    def times(Z: Array) -> Array:
+        X, q = Z[: N * n].reshape(N, n, -1), Z[N * n :].reshape(N - 1, n, -1)
+        X = X - alpha * (M @ X + half * _spread(island.L, X) + _spread(Q, q))
+        q = q + _spread(Q.T, half * _spread(island.L, X))
+        return np.vstack([X.reshape(N * n, -1), q.reshape((N - 1) * n, -1)])
+
+    return times
 
 
 def relaxed_matrix(island: Island, c: float, degrees: Array) -> Array:
@@ -168,16 +199,21 @@ def admm_matrix(island: Island, options: Options, steps: Array) -> Array:
     return np.block([[F11, F12], [pull @ F11, np.eye((N - 1) * n) + pull @ F12]])
 
 
-def rounds_to(error: float, island: Island, options: Options, radius: float) -> int | None:
+def rounds_to(error: float, island: Island, options: Options, radius: float, say: Say = lambda _: None) -> int | None:
     """Exchanges until the worst error is below ``error``; None when the fusion does not get there.
 
     Followed exactly for 500 exchanges, then extrapolated with the spectral radius.
     """
-    last, reached = 0, np.inf
+    last, reached, enough = 0, np.inf, np.sqrt(len(island.H)) * error
     for last, X in enumerate(islice(iterates(island, options), 501)):
-        reached = worst_error(X)
-        if reached <= error:
-            return last
+        if last % 50 == 0:
+            say(f"error after {last} rounds")
+        if (
+            last == 500 or np.linalg.norm(X - np.eye(X.shape[1]), axis=(1, 2)).max() <= enough
+        ):  # not above sqrt(n) |.|_2
+            reached = worst_error(X)
+            if reached <= error:
+                return last
     if options.fusion == "finite_time" or radius >= 1:
         return None
     return last + int(np.ceil(np.log(reached / error) / -np.log(radius)))
@@ -198,7 +234,9 @@ def theorem_bound(island: Island, options: Options, nu: int, size: float) -> flo
     return float(first + (2 / options.gamma + steps * size**2 / 2) / (nu * np.sqrt(connectivity)))
 
 
-def island_facts(island: Island, options: Options, eigenvalues: Array, radius: float, gains: Array) -> dict[str, Any]:
+def island_facts(
+    island: Island, options: Options, eigenvalues: Array, radius: float, gains: Array, say: Say
+) -> dict[str, Any]:
     """What the certificate says about one island."""
     rounds = fusion_rounds({**options.model_dump(), "eigenvalues": spectrum(island.L)})
     return {
@@ -207,7 +245,7 @@ def island_facts(island: Island, options: Options, eigenvalues: Array, radius: f
         "H_condition": float(eigenvalues[-1] / eigenvalues[0]),
         "fusion_radius": radius,
         "rounds": rounds,
-        "rounds_to_1e-6": rounds_to(1e-6, island, options, radius),
-        "predicted_fusion_error": {str(k): e for k, e in predicted_errors(island, options, rounds).items()},
+        "rounds_to_1e-6": rounds_to(1e-6, island, options, radius, say),
+        "predicted_fusion_error": {str(k): e for k, e in predicted_errors(island, options, rounds, say).items()},
         "noise_gain": gains.tolist(),
     }

@@ -38,6 +38,8 @@ from duio_mesh.synthesis.uio import decouple_node
 __all__ = ["RADIUS_OF", "Options", "design", "error_radius"]
 
 RADIUS_OF = "error matrix (12), per step"
+LARGEST = 1000
+"""Rows of the error matrix that the dense design still handles."""
 
 
 class Figures(NamedTuple):
@@ -61,9 +63,17 @@ def design(scenario: Scenario, progress: Progress) -> Design:
     progress("existence conditions")
     network, views, margins = _network(scenario, options)
     stability = stable_radius(min(options.rate, 1 - 1e-9))
+    rows = len(network.sensors) * network.n * (1 + options.delay)
+    progress(f"existence conditions of {len(network.sensors)} nodes")
     sources = check(scenario.graph, views, scenario.plant.A, stability)
+    if rows > LARGEST:
+        raise DesignError(
+            f"augmented: gains exist (Theorem 8 holds), but the error matrix (12) has {rows} rows and is dense; from "
+            f"{LARGEST} on a design takes hours. method: lmi (coupling gains by products with blocks) and "
+            "method: admm handle thousands; or use fewer nodes"
+        )
     gains = find_gains(scenario, network, options, progress)
-    progress("certificate")
+    progress(f"certificate: eigenvalues, powers and distance to instability of {rows} rows")
     figures = _figures(network, gains)
     _refuse(figures, options)
     certificate = {

@@ -40,11 +40,15 @@ def h2_gains(
     for k in range(starts):
         progress(f"H2 design, start {k + 1} of {starts}")
         theta = _start(system, network, np.random.default_rng([seed, k]), spread=0.3 if k else 0.0)
-        theta, reached = _stabilise(system, theta, rate, max(transient, _BRAVE))
+
+        def say(what: str, k: int = k) -> None:
+            progress(f"H2 design, start {k + 1} of {starts}: {what}")
+
+        theta, reached = _stabilise(system, theta, rate, max(transient, _BRAVE), say)
         closest = min(closest, reached)
         if reached >= rate:
             continue
-        cost = Cost(system, transient, rate)
+        cost = Cost(system, transient, rate, say)
         theta, J = minimise(cost, theta, _LAST, rtol=1e-9)
         if value > J:
             best, value = theta, J
@@ -59,8 +63,8 @@ def h2_gains(
 class Cost:
     """J and its gradient with respect to the free entries of Theta, for Phi / gamma instead of Phi."""
 
-    def __init__(self, system: ErrorSystem, transient: float, gamma: float) -> None:
-        self.system, self.gamma = system, gamma
+    def __init__(self, system: ErrorSystem, transient: float, gamma: float, say: Progress = lambda _: None) -> None:
+        self.system, self.gamma, self._say, self._done = system, gamma, say, 0
         mean = float(np.trace(system.V)) / max(1, system.outputs)
         # without any noise the design assumes equal noise everywhere; otherwise only the covariance's shape matters
         self.V = system.V / mean if mean > 0 else np.eye(system.outputs)
@@ -71,6 +75,8 @@ class Cost:
 
     def __call__(self, theta: Array) -> tuple[float, Array]:
         system, gamma = self.system, self.gamma
+        self._say(f"spectral radius below {gamma:.4f}, {self._done} values of the cost")
+        self._done += 1
         Theta = _unpack(system, theta)
         Phi = system.matrix(Theta)
         Gamma = system.noise_input(Phi, Theta)
@@ -86,7 +92,7 @@ class Cost:
         return float(np.sum(self.weight * X)), dTheta[system.free]
 
 
-def _stabilise(system: ErrorSystem, theta: Array, rate: float, transient: float) -> tuple[Array, float]:
+def _stabilise(system: ErrorSystem, theta: Array, rate: float, transient: float, say: Progress) -> tuple[Array, float]:
     """Lower gamma from above the start's spectral radius to ``rate``; the last gains and their spectral radius."""
     radius = spectral_radius(system.matrix(_unpack(system, theta)))
     gamma = np.inf
@@ -97,7 +103,7 @@ def _stabilise(system: ErrorSystem, theta: Array, rate: float, transient: float)
         if wanted > 0.9995 * gamma:
             break  # stuck
         gamma = wanted
-        theta, _ = minimise(Cost(system, transient, gamma), theta, _PER_STAGE, rtol=1e-6)
+        theta, _ = minimise(Cost(system, transient, gamma, say), theta, _PER_STAGE, rtol=1e-6)
         radius = spectral_radius(system.matrix(_unpack(system, theta)))
     return theta, radius
 

@@ -15,6 +15,7 @@ from scipy import sparse
 from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigs
 
 from duio_mesh.arrays import Array
+from duio_mesh.errors import DesignError
 from duio_mesh.geometry.stability import spectral_radius
 from duio_mesh.synthesis.sampled import Coupled, error_system
 
@@ -22,8 +23,10 @@ Say = Callable[[str], None]
 
 DENSE = 500
 """Rows up to which all eigenvalues are computed (a second)."""
-WANTED, BASIS, TOLERANCE = 6, 60, 1e-9
-"""Arnoldi's method: eigenvalues, vectors kept between restarts, relative accuracy."""
+WANTED, BASIS, TOLERANCE, RESTARTS = 2, 120, 1e-9, 100
+"""Arnoldi's method: eigenvalues, vectors before a restart, relative accuracy."""
+HOPELESS = 3000
+"""Rows from which all eigenvalues are not computed even when Arnoldi's method fails: that would take hours."""
 FORGOTTEN, LONGEST = 1e-6, 20_000
 """A stationary covariance is summed until so little is missing, or given up after so many steps."""
 
@@ -79,7 +82,10 @@ class Stacked:
 def largest_modulus(
     size: int, times: Callable[[Array], Array], dense: Callable[[], Array], say: Say = lambda _: None
 ) -> float:
-    """Largest modulus of an eigenvalue of a real operator: ``times`` (size, k) -> (size, k), ``dense`` forms it."""
+    """Largest modulus of an eigenvalue of a real operator: ``times`` (size, k) -> (size, k), ``dense`` forms it.
+
+    Raises DesignError when Arnoldi's method fails on more rows than ``dense`` is for.
+    """
     if size <= DENSE:
         return spectral_radius(dense())
     done = 0
@@ -100,10 +106,15 @@ def largest_modulus(
             which="LM",
             v0=start,
             tol=TOLERANCE,
-            maxiter=500,
+            maxiter=RESTARTS,
             return_eigenvectors=False,
         )
     except ArpackNoConvergence:
-        say(f"all {size} eigenvalues, because Arnoldi's method does not separate the largest; minutes if thousands")
+        if size > HOPELESS:
+            raise DesignError(
+                f"the spectral radius of a recursion with {size} rows was not found: Arnoldi's method did not separate "
+                f"its largest eigenvalues in {done} products, and all eigenvalues would take hours"
+            ) from None
+        say(f"all {size} eigenvalues, because Arnoldi's method does not separate the largest")
         return spectral_radius(dense())
     return float(np.abs(values).max())

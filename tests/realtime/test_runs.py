@@ -130,7 +130,9 @@ def test_the_others_go_on_without_a_node_that_is_stopped_and_it_catches_up() -> 
 
 def test_the_plant_waits_for_a_node_that_is_a_window_behind_and_says_so() -> None:
     timing = "timing={mode: realtime, tick: 0.02}"
-    with Stopped("ring.yaml", "--set", timing, "--set", "run.window=8", "--no-record", steps=90) as stopped:
+    with Stopped("ring.yaml", "--set", timing, "--set", "run.window=8", steps=90) as stopped:
+        wait_for(lambda: any(event["event"] == "ready" for event in stopped.said("recorder")))
+        stopped.send("recorder", signal.SIGKILL)  # the recording is then made from the trace
         stopped.stop_and_go(3, seconds=0.6)  # that is 30 ticks, and 8 of them can pass
         assert stopped.end() in (0, 1), stopped.stderr
         plant = stopped.metrics()["timing"]["plant"]
@@ -138,6 +140,9 @@ def test_the_plant_waits_for_a_node_that_is_a_window_behind_and_says_so() -> Non
     assert plant["late_ticks"] >= 20
     assert plant["worst_lateness"] >= 0.6 - 9 * 0.02
     assert any(who.startswith("node-3 (at step") for who in plant["behind"])
+    missing = recorded(stopped.out / "recording.rrd", "/missing/node_2")
+    assert missing[0] == 0
+    assert max(missing) >= 1
     assert "kept it waiting" in " ".join(stopped.stdout.split())
 
 

@@ -103,6 +103,39 @@ def test_a_gap_is_a_gap_in_lines_and_lanes_and_the_return_is_seen(tmp_path: Path
     assert read_texts(path, "/alive/node_2", COLUMN) == [(0, "up"), (50, "down"), (60, "up")]
 
 
+@pytest.mark.parametrize("flushes", [0, 1, 4])
+def test_a_gap_is_where_the_rows_say_though_the_news_of_it_came_at_another_time(tmp_path: Path, flushes: int) -> None:
+    """A fast run: the recorder hears of death and return between two batches of rows, and of the start too late."""
+    spec, truth, rows = marked(tmp_path / "r.rrd")
+    with Recording(spec) as recording:
+        recording.liveness(1, "up", 0)
+        recording.truth(0, truth)
+        recording.estimates(1, 0, rows[1])
+        recording.estimates(2, 0, rows[2][:20])
+        recording.liveness(2, "up", 19)
+        recording.estimates(2, 20, rows[2][20:50])
+        recording.liveness(2, "down", 19)
+        for _ in range(flushes):
+            recording.flush()  # two of them without news of rows: it is believed
+        recording.liveness(2, "up", 49)
+        recording.flush()
+        recording.estimates(2, 60, rows[2][60:80])
+        recording.flush()
+        recording.liveness(2, "down", 79)
+        recording.liveness(2, "up", 79)
+        recording.estimates(2, 90, rows[2][90:])
+    path = tmp_path / "r.rrd"
+    states = [(0, "up"), (50, "down"), (60, "up"), (80, "down"), (90, "up")]
+    assert read_texts(path, "/alive/node_2", COLUMN) == states
+    told = [(k, text) for k, text in read_texts(path, "/events", "TextLog:text") if "node-2" in text]
+    assert told == [
+        (50, "node-2 is down"),
+        (60, "node-2 is up again"),
+        (80, "node-2 is down"),
+        (90, "node-2 is up again"),
+    ]
+
+
 def lossy_trace() -> Trace:
     rng = np.random.default_rng(0)
     x = rng.standard_normal((50, 3))

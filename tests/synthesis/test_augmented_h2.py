@@ -181,3 +181,9 @@ def test_the_start_is_mild_where_a_node_barely_sees_a_direction():
         F = mild_filter(C, A)
         assert np.linalg.norm(F, 2) < 5
     assert not mild_filter(np.zeros((1, 6)), scenario.plant.A).any()
+
+
+def test_too_large_is_said_before_the_search(monkeypatch):
+    monkeypatch.setattr("duio_mesh.synthesis.augmented.LARGEST", 8)
+    with pytest.raises(DesignError, match=r"gains exist .* has \d+ rows and is dense; .*method: lmi"):
+        synthesise(load("example9"))
