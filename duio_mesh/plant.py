@@ -52,9 +52,12 @@ class Credits:
 
     def admit(self, k: int) -> dict[int, int]:
         """Who comes back at step k -> processes of it before; those that are meant to are waited for."""
-        expected = self._spec.returns.get(k, ())
+        absent = self._spec.absent
+        expected = [i for i, spans in absent.items() if any(after == k for _, after in spans)]
         self._until(lambda: [i for i in expected if i not in self._asking], k)
-        back, self._asking = self._asking, {}
+        early = {i for i in self._asking if any(first <= k < after for first, after in absent.get(i, ()))}
+        back = {i: before for i, before in self._asking.items() if i not in early}
+        self._asking = {i: before for i, before in self._asking.items() if i in early}
         self._done |= dict.fromkeys(back, k)
         self.away -= back.keys()
         return back
@@ -140,8 +143,9 @@ def run(spec: PlantSpec, report: Report) -> None:
         credits, begin, cpu = Credits(mesh, nodes, spec, report), time.monotonic(), time.process_time()
         pace = Pace(spec, credits)
         rows: dict[int, list[Array]] = {}
+        returns = [after for spans in spec.absent.values() for _, after in spans]
         with Journal(spec.output, plant.x.size, truth) as journal:
-            for block in blocks(0, spec.steps, spec.block, spec.returns):
+            for block in blocks(0, spec.steps, spec.block, returns):
                 credits.collect()
                 credits.wait(block.stop - spec.window)
                 if back := credits.admit(block.start):

@@ -17,7 +17,7 @@ import msgpack
 import numpy as np
 
 from duio_mesh.arrays import Array, contiguous
-from duio_mesh.faults import UNDISTURBED, Incoming, NodeFault, Rule
+from duio_mesh.faults import UNDISTURBED, Incoming, NodeFault, Rule, Span
 
 START = 30.0  # seconds for all processes of a run to find each other
 PATIENCE = 3  # deadlines: where a run goes on without lost nodes, the launcher settles first who is lost
@@ -150,7 +150,7 @@ class PlantSpec:
     block: int  # steps whose samples travel in one frame
     deadline: float
     on_loss: str = "stop"  # when a node is lost
-    returns: Mapping[int, tuple[int, ...]] = dataclasses.field(default_factory=dict)  # step: nodes to wait for there
+    absent: Mapping[int, tuple[Span, ...]] = dataclasses.field(default_factory=dict)  # node: steps without it, planned
     tick: float = 0.0  # wall seconds per step; 0: as fast as the slowest node
     wait: float = 0.0  # least seconds between two samples when it is behind the wall clock
     recorded: bool = False  # there is a recorder to wait for, a little

@@ -111,7 +111,7 @@ def plant_spec(scenario: Scenario) -> PlantSpec:
         block=1 if scenario.outside else flow.quarter,
         deadline=run.deadline,
         on_loss=run.on_node_loss,
-        returns=scenario.faults.returns(),
+        absent={i: spans for i in scenario.nodes if (spans := scenario.faults.absences(i))},
         outside=scenario.outside,
     )
 
