@@ -16,7 +16,7 @@ from duio_mesh.mesh.realtime import Realtime
 from duio_mesh.mesh.rejoin import HELLO, JOINED, Admission, ask, come_back
 from duio_mesh.mesh.session import Ready
 from duio_mesh.observers import make_observer
-from duio_mesh.observers.absence import Late, neighbours_mean, part_with, start_again, take_late, welcome
+from duio_mesh.observers.absence import Late, greeting, part_with, start_again, take_late, welcome
 from duio_mesh.process import Report
 from duio_mesh.spec import PATIENCE, NodeSpec, blocks
 from duio_mesh.tape import Tape
@@ -105,7 +105,7 @@ class Links:
             if not near or not self.mesh.await_birth(Member(f"node-{j}", before), RETURN):
                 continue  # gone again already: it stays lost
             if j in spec.tells and spec.warm and k:
-                self.told.send_to(spec.tells.index(j), k, HELLO, self.observer.estimate().state)
+                self.told.send_to(spec.tells.index(j), k, HELLO, greeting(self.observer.estimate()))
             if j in spec.hears and isinstance(self.exchange, FaultyExchange):
                 self.heard[j].expect(before)
                 self.exchange.welcome(j)
@@ -125,12 +125,12 @@ class Links:
         k = lockstep.first = admission.first
         self.observer = self.tape.follow(make_observer(replace(spec, steps=spec.steps - k)), k, spec.incarnation)
         told = [x for j in self.heard if (x := self._greeted(lockstep, j, admission)) is not None]
-        start_again(self.observer, neighbours_mean(told), admission.data, spec.p)
+        start_again(self.observer, told, admission.data, spec.p)
         self._report("back", k=k, told_by=len(told))
         return k
 
     def _greeted(self, lockstep: Lockstep, j: int, admission: Admission) -> Array | None:
-        """Neighbour j's estimate, if it has one for us; from now on it is expected, or known to be gone."""
+        """Neighbour j's greeting, if it has one for us; from now on it is expected, or known to be gone."""
         exchange, line, k = self.exchange, self.heard[j], admission.first
         assert isinstance(exchange, FaultyExchange)  # noqa: S101  (spec.on_loss is restart)
         if not exchange.expects(j, k):
@@ -138,7 +138,7 @@ class Links:
         try:
             line.expect(self._process_of(j, admission))
             if self._spec.warm and admission.data.size and j not in admission.joined:
-                return lockstep.take(line, k, HELLO, self._spec.n)
+                return lockstep.take(line, k, HELLO, self._spec.n + 1)
         except LinkLost as e:
             exchange.lose(j, k, 0, str(e))
         return None

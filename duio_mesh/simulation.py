@@ -12,7 +12,7 @@ from duio_mesh.dynamics import Plant
 from duio_mesh.errors import RunError
 from duio_mesh.faults import Reception, Stamp
 from duio_mesh.observers import make_observer
-from duio_mesh.observers.absence import Late, neighbours_mean, part_with, start_again, take_late, welcome
+from duio_mesh.observers.absence import Late, greeting, part_with, start_again, take_late, welcome
 from duio_mesh.observers.base import NOTHING, reader
 from duio_mesh.observers.watch import watcher
 from duio_mesh.spec import NodeSpec
@@ -97,12 +97,12 @@ def _come_and_go(design: Design, nodes: dict[int, _Node], k: int, before: Mappin
         for j in nodes[fault.node].spec.tells:
             part_with(nodes[j].observer, fault.node)
     back = faults.returns().get(k, ())
-    starts = {i: neighbours_mean(_told(nodes, i)) for i in back}  # before anybody of them is back
+    told = {i: _told(nodes, i) if nodes[i].spec.warm else [] for i in back}  # before anybody of them is back
     for i in back:
         node, p = nodes[i], design.nodes[i].p
         node.present = True
         node.begin(design.plant.steps - k)
-        start_again(node.observer, starts[i] if node.spec.warm and before else None, before.get(i, NOTHING), p)
+        start_again(node.observer, told[i], before.get(i, NOTHING), p)
         for j in node.spec.hears:
             if not nodes[j].present and j not in back:
                 part_with(node.observer, j)
@@ -111,9 +111,9 @@ def _come_and_go(design: Design, nodes: dict[int, _Node], k: int, before: Mappin
 
 
 def _told(nodes: Mapping[int, _Node], i: int) -> list[Array]:
-    """The newest estimates of x of those in-neighbours of node i that are there, in ascending order of id."""
+    """The greetings of those in-neighbours of node i that are there, in ascending order of id."""
     there = [nodes[j] for j in sorted(nodes[i].spec.hears) if nodes[j].present and nodes[j].rows]
-    return [node.rows[-1][: nodes[i].spec.n] for node in there]
+    return [greeting(node.observer.estimate()) for node in there]
 
 
 class _InEdges:

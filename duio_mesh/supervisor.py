@@ -262,8 +262,9 @@ class Supervisor:
         killed = [p.death() for p in self._essential() if p.code and p.code < 0]
         failed = [p.failure for p in self._essential() if p.failure]
         first = [p.failure for p in self._essential() if p.failure and not p.lost]
+        then = [text for text in failed if text not in first]
         stopped = [f"{p.who} is {p.state()}" for p in self._roots() if p.state()]
-        return "; ".join(killed + first + [text for text in failed if text not in first] + stopped) or "; ".join(p.death() for p in self._essential() if p.code)
+        return "; ".join(killed + first + then + stopped) or "; ".join(p.death() for p in self._essential() if p.code)
 
     def _until(self, done: Callable[[], bool], timeout: float) -> None:
         end = time.monotonic() + timeout

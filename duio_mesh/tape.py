@@ -44,7 +44,7 @@ VERSION = 1
 MAGIC = "duio_mesh tape"
 PERIOD = 0.01  # seconds between chunks
 FULL = 1 << 16  # bytes
-CALLS = frozenset({"part_with", "welcome", "resume", "distrust"})
+CALLS = frozenset({"part_with", "welcome", "resume", "distrust", "mistrust"})
 """Calls beyond the step machine's own that change an observer. A tape holds no others."""
 LOOKS = frozenset({"watched"})  # calls that change nothing that an estimate depends on
 

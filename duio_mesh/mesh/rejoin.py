@@ -10,7 +10,7 @@ their first message of step B; from these and its own sample of step B-1 it star
 | credit/<i> | ``ASK`` | from the new process, k = how many processes of this node were there before |
 | plant/<j> | ``JOINED`` | at step k come back: rows [node, processes before], to everybody |
 | plant/<i> | ``AWAY``, ``YOURS`` | to those who come back: who is not there, and [y; u](k-1) or nothing when k = 0 |
-| edge/<j>/<i> | ``HELLO`` | x-hat_j(k-1) |
+| edge/<j>/<i> | ``HELLO`` | x-hat_j(k-1), and 1 when that is not to be trusted |
 """
 
 from __future__ import annotations

@@ -21,6 +21,7 @@ from duio_mesh.spec import NodeSpec
 PATIENCE = 5  # steps (relaxed fusion: rounds) without a neighbour that are bridged without a flag
 MISS = 3  # a neighbour that misses more than one in 1 + MISS exchanges is as good as silent
 HELD = 1000.0  # steps that the bias of a stale vector is taken to last
+UNSETTLED = 0.5  # of a doubt: the fusion is right, but not what goes into it
 MEMORY = 64  # own messages that are kept to be paired with late ones
 
 
@@ -45,38 +46,40 @@ def flagged(observer: Observer) -> bool:
     return bool(getattr(observer, "flagged", False))
 
 
-def neighbours_mean(told: Sequence[Array]) -> Array | None:
-    """Where a node that comes back starts: the mean of its neighbours' estimates (n,); None when nobody tells any."""
-    return sum(told[1:], told[0]) / len(told) if told else None
+def greeting(estimate: Estimate) -> Array:
+    """What a node tells a neighbour that comes back: its estimate of x (n,) and the mark."""
+    return np.append(estimate.state, estimate.flag)
 
 
-def start_again(observer: Observer, x: Array | None, data: Array, p: int) -> None:
-    """Begin after a step with x-hat = ``x`` and own data [y; u], y of ``p`` numbers; without an x from nothing."""
-    if x is None:
-        distrust(observer)
-    else:
-        observer.resume(x, data[:p], data[p:])
+def start_again(observer: Observer, told: Sequence[Array], data: Array, p: int) -> None:
+    """Begin after a step with the mean of the neighbours' greetings (n + 1,) and the own data [y; u], p numbers in y.
+
+    Where nobody has told anything it begins from nothing.
+    """
+    if not told:
+        _call(observer, "distrust")
+        return
+    mean = sum(told[1:], told[0]) / len(told)
+    observer.resume(mean[:-1], data[:p], data[p:])
+    if mean[-1]:
+        _call(observer, "mistrust")
 
 
 def part_with(observer: Observer, j: int) -> None:
     """Tell the observer that neighbour j's process is gone: nothing will come until ``welcome``."""
-    parted: Callable[[int], None] | None = getattr(observer, "part_with", None)
-    if parted is not None:
-        parted(j)
+    _call(observer, "part_with", j)
 
 
 def welcome(observer: Observer, j: int) -> None:
     """Tell the observer that neighbour j is there again, from the coming exchange on."""
-    back: Callable[[int], None] | None = getattr(observer, "welcome", None)
-    if back is not None:
-        back(j)
+    _call(observer, "welcome", j)
 
 
-def distrust(observer: Observer) -> None:
-    """Tell the observer that it begins late and from nothing: its first estimates are not worth much."""
-    unsettled: Callable[[], None] | None = getattr(observer, "distrust", None)
-    if unsettled is not None:
-        unsettled()
+def _call(observer: Observer, name: str, *arguments: int) -> None:
+    """What only a guard understands."""
+    method: Callable[..., None] | None = getattr(observer, name, None)
+    if method is not None:
+        method(*arguments)
 
 
 class Silence:
@@ -147,6 +150,9 @@ class _Guard:
     def distrust(self) -> None:
         """This node begins late and from nothing: its errors need ``spec.settling`` steps."""
         self._unsettled = self._settling
+
+    def mistrust(self) -> None:
+        """It begins from estimates that were marked; whoever marked them says in the next exchange for how long."""
 
     def resume(self, x: Array, y: Array, u: Array) -> None:
         """As the method does."""
@@ -243,6 +249,14 @@ class Fused(_Guard):
             self._AB = np.hstack([spec.matrices["A"], spec.matrices["B"]])
         self._x = np.zeros(spec.n)
 
+    def message(self, r: int) -> Array:
+        """The method's vector, then the doubt; what is only unsettled spoils no fusion, and counts for less than 1."""
+        return np.append(self._inner.message(r), max(self._doubt, UNSETTLED * (self._unsettled > 0)))
+
+    def mistrust(self) -> None:
+        """It begins from estimates that were marked; its local estimate goes on from there, as from nothing."""
+        self.distrust()
+
     def sample(self, y: Array, u: Array) -> None:
         """As the method does; the first sample after an estimate begins a step without doubt."""
         if self._results:
@@ -273,9 +287,11 @@ class Fused(_Guard):
         self._inner.exchange(r, given)
 
     def _doubted(self, heard: Mapping[int, Array], told: float) -> float:
+        unsettled = UNSETTLED * (told > 0 or self._doubt > 0)
         if self._exact:
-            return float(self._doubt or told or any(j not in heard and j not in self._excused for j in self._hears))
-        return max(self._silence.note(heard, self._excused), told - 1, self._doubt - 1, 0.0)
+            missed = any(j not in heard and j not in self._excused for j in self._hears)
+            return 1.0 if missed or told >= 1 or self._doubt >= 1 else unsettled
+        return max(self._silence.note(heard, self._excused), told - 1, self._doubt - 1, unsettled)
 
     def resume(self, x: Array, y: Array, u: Array) -> None:
         """As the method does; x-hat and the inputs of the step before are what ``predict`` goes on from."""
@@ -289,7 +305,7 @@ class Fused(_Guard):
     def batch(self) -> Sequence[Estimate]:
         """Of every sample since the last rounds."""
         if not self._results and self._inputs:
-            doubtful = self._AB is not None and self.flagged
+            doubtful = self._AB is not None and self._doubt >= 1
             found = self._predicted() if doubtful else [e.state.copy() for e in reader(self._inner)()]
             self._results = [self._marked(Estimate(x)) for x in found]
         return self._results

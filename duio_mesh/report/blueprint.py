@@ -145,7 +145,9 @@ def _estimates(entities: Entities, worst: Sequence[int]) -> rrb.Container:
     errors = []
     if worst:
         name = f"The {len(chosen)} worst nodes"
-        errors.append(_plot(f"{name}: log10 ‖x̂ − x‖", [entities.error(i) for i in chosen], legend=len(chosen) <= LEGEND))
+        errors.append(
+            _plot(f"{name}: log10 ‖x̂ − x‖", [entities.error(i) for i in chosen], legend=len(chosen) <= LEGEND)
+        )
 
     def grid(nodes: Iterable[int], name: str) -> rrb.Container:
         views = list(errors)
