@@ -34,7 +34,7 @@ FLOORS = [
     ],
     ["report", "process"],
     ["synthesis", "simulation", "node", "plant", "gateway", "recorder", "router", "health"],
-    ["nursery", "supervisor", "run_folder", "schema", "credentials", "wiring", "limits"],
+    ["nursery", "supervisor", "run_folder", "schema", "credentials", "wiring", "limits", "placement"],
     ["launcher"],
     ["api", "console", "generate", "replay", "deploy"],
     ["cli"],
