@@ -27,11 +27,12 @@ types: $(VENV)/tests ## mypy, strict
 schema: $(VENV)/ready ## rewrite the JSON schema that editors use for topology files
 	$(PY) -m duio_mesh.schema topologies/schema.json
 
-bench: $(VENV)/ready ## speed, as ratios inside one interleaved run; the tables of docs/performance.md
+bench: $(VENV)/tests ## speed, as ratios inside one interleaved run; the tables of docs/performance.md
 	-$(PY) -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[bench]'
 	$(PY) bench/exchange.py --repeat 3 --rounds 4000
 	$(PY) bench/admm.py
 	$(PY) bench/startup.py
+	$(PY) bench/design.py
 	$(PY) bench/tape.py
 
 scale: $(VENV)/ready ## rings of up to 128 sensor processes on this machine: speed, start, memory; into docs/scaling.md

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import sys
+import time
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
@@ -21,6 +22,7 @@ from duio_mesh.synthesis.design import Design
 
 SLOW = 0.1  # of an error left by a step that starts afresh: the estimate is not worth its name
 MANY = 16  # nodes or warnings, from which on only some are shown
+QUIET = 5.0  # seconds without a word about a design in a log
 FEW = 8  # nodes whose errors are shown one by one
 
 _out = Console(highlight=False)
@@ -29,9 +31,20 @@ _err = Console(stderr=True, highlight=False)
 
 @contextlib.contextmanager
 def working(on: str) -> Iterator[Callable[[str], None]]:
-    """Show that something is being done, and what part of it."""
+    """Show that something is being done, and what part of it: in a log, a line every few seconds."""
+    last = time.monotonic()
+
+    def line(part: str) -> None:
+        nonlocal last
+        if time.monotonic() - last >= QUIET:
+            last = time.monotonic()
+            _err.print(f"{on}: {part}", soft_wrap=True, markup=False)
+
+    if not _err.is_terminal:
+        yield line
+        return
     with _err.status(on) as status:
-        yield lambda part: status.update(f"{on}: {part}")
+        yield lambda part: status.update(f"{on}: {escape(part)}")
 
 
 @contextlib.contextmanager

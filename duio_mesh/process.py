@@ -68,7 +68,10 @@ def live(kind: type[Spec], run: Callable[[Spec, Report], None], path: Path, repo
 
     signal.signal(signal.SIGTERM, stop)
     try:
-        run(read_spec(path, kind), report)
+        spec = read_spec(path, kind)
+        if spec.wire.core is not None:
+            os.sched_setaffinity(0, {spec.wire.core})
+        run(spec, report)
     except Stop:
         report("stopped")
         return STOPPED

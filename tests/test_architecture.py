@@ -35,7 +35,7 @@ FLOORS = [
     ["report", "process"],
     ["links"],
     ["synthesis", "simulation", "node", "plant", "gateway", "recorder", "router", "health"],
-    ["nursery", "supervisor", "run_folder", "schema", "credentials", "wiring", "limits"],
+    ["nursery", "supervisor", "run_folder", "schema", "credentials", "wiring", "limits", "placement"],
     ["recovery"],
     ["launcher"],
     ["api", "console", "generate", "replay", "deploy"],

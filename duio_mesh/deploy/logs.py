@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 from duio_mesh.supervisor import Process, Supervisor
 
@@ -13,7 +14,9 @@ class Logs(Supervisor):
 
     def __init__(self) -> None:
         self.processes = {}
-        self._beats = 0
+        self.events: list[dict[str, Any]] = []  # what happened to nodes on the way: nobody watched
+        self.note = ""
+        self._beats, self._begin = 0, 0.0
 
     def read(self, who: str, log: Path) -> None:
         """Take in a process' log: JSON lines, as it wrote them to its log or to its standard output.

@@ -152,9 +152,9 @@ class Container:
             env=os.environ | service["environment"],
         )
 
-    def healthy(self) -> bool:
+    def healthy(self, *options: str) -> bool:
         """What its health check says."""
-        command = ["nsenter", "-t", str(self.process.pid), "-m", "-n", "--", *self._here("healthcheck")]
+        command = ["nsenter", "-t", str(self.process.pid), "-m", "-n", "--", *self._here("healthcheck"), *options]
         return subprocess.run(command, capture_output=True, timeout=20).returncode == 0
 
     def output(self) -> str:

@@ -82,7 +82,7 @@ def test_a_run_over_three_hosts_equals_the_oracle_bit_for_bit(transport: str, la
         wait_for(south.healthy)
         if transport == "direct":
             south.process.send_signal(signal.SIGSTOP)
-            assert not south.healthy()
+            assert not south.healthy("--timeout", "1")
             south.process.send_signal(signal.SIGCONT)
             assert south.healthy()
         else:
