@@ -16,6 +16,7 @@ import statistics
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -25,12 +26,13 @@ from interleave import Contenders, Results, interleaved, machine, table
 from page import Page
 from processes import memories
 
-from duio_mesh import launcher
+from duio_mesh import launcher, placement
 from duio_mesh.launcher import Progress
 from duio_mesh.supervisor import Supervisor
 
 ROUNDS = 199  # exchanges per step
 REFERENCE = "4 nodes"
+FEW = placement.CROWD
 
 
 class Run(NamedTuple):
@@ -48,8 +50,10 @@ def ready(logs: Path) -> float:
     return max(float(event["time"]) for event in events if event["event"] == "ready")
 
 
-def measure(count: int, steps: int, record: bool, runs: dict[str, list[Run]], name: str) -> float:
-    """Rounds per second of one run, times N; the rest is added to ``runs``."""
+def measure(count: int, steps: int, kind: str, runs: dict[str, list[Run]], name: str) -> float:
+    """Rounds per second of one run, times N; the rest is added to ``runs``. ``kind``: recorded, anywhere, or ""."""
+    record = kind == "recorded"
+    placement.CROWD = FEW if kind != "anywhere" else 1 << 30
     sizes: list[float] = []
 
     def look(progress: Progress) -> None:
@@ -70,14 +74,14 @@ def measure(count: int, steps: int, record: bool, runs: dict[str, list[Run]], na
     return speed * count
 
 
-def contenders(counts: list[int], recorded: list[int], rounds: int, runs: dict[str, list[Run]]) -> Contenders:
-    """A measurement for every N, and with a recorder where it is asked for."""
-    found = {}
-    for record, many in ((False, counts), (True, recorded)):
+def contenders(counts: dict[str, list[int]], rounds: int, runs: dict[str, list[Run]]) -> Contenders:
+    """A measurement for every kind and N."""
+    found: dict[str, Callable[[], float]] = {}
+    for kind, many in counts.items():
         for count in many:
-            name = f"{count} nodes" + (", recorded" if record else "")
+            name = f"{count} nodes" + (f", {kind}" if kind else "")
             steps = max(3, round(4 * rounds / count / ROUNDS))
-            found[name] = partial(measure, count, steps, record, runs, name)
+            found[name] = partial(measure, count, steps, kind, runs, name)
     return found
 
 
@@ -87,13 +91,15 @@ def main() -> None:
     parser.add_argument("--nodes", type=int, nargs="*", default=[16, 64, 128], help="beside the ring of 4")
     parser.add_argument("--rounds", type=int, default=20_000, help="of the ring of four; N nodes do 4/N of them")
     parser.add_argument("--record", type=int, nargs="*", default=[64], help="rings that are run with a recorder, too")
+    parser.add_argument("--anywhere", type=int, nargs="*", default=[64], help="rings left to the kernel, on any core")
     parser.add_argument("--repeat", type=int, default=5)
     parser.add_argument("--write", action="store_true", help="put the tables into docs/scaling.md")
     args = parser.parse_args()
     page = Page("scaling.md", "rings")
     page.say(f"{machine()}; {args.repeat} repetitions\n")
     runs: dict[str, list[Run]] = {}
-    results: Results = interleaved(contenders([4, *args.nodes], args.record, args.rounds, runs), args.repeat)
+    counts = {"": [4, *args.nodes], "recorded": args.record, "anywhere": args.anywhere}
+    results: Results = interleaved(contenders(counts, args.rounds, runs), args.repeat)
     page.say(table("ring", results, REFERENCE, "rounds/s times N"))
     page.say("| ring | rounds/s | ready after, s | PSS of the largest node, MB | the oracle's estimates |")
     page.say("|---|---|---|---|---|")
