@@ -21,10 +21,13 @@ class Logs(Supervisor):
     def read(self, who: str, log: Path) -> None:
         """Take in a process' log: JSON lines, as it wrote them to its log or to its standard output.
 
-        Raises ValueError when it is something else.
+        Other lines (a container's log has its standard error, too) are passed over. Raises ValueError for JSON that is
+        no event.
         """
         self.processes[who] = Process(who)
         for number, line in enumerate(log.read_text(encoding="utf-8").splitlines(), 1):
+            if not line.startswith("{"):
+                continue
             try:
                 event = json.loads(line)
                 self._hear({**event, "who": who})
