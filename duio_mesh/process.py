@@ -68,10 +68,7 @@ def live(kind: type[Spec], run: Callable[[Spec, Report], None], path: Path, repo
 
     signal.signal(signal.SIGTERM, stop)
     try:
-        spec = read_spec(path, kind)
-        if spec.wire.core is not None:
-            os.sched_setaffinity(0, {spec.wire.core})
-        run(spec, report)
+        run(read_spec(path, kind), report)
     except Stop:
         report("stopped")
         return STOPPED

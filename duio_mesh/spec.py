@@ -59,7 +59,6 @@ class Wire:
     mode: str = "peer"  # peer | client (of a router) | router
     start: float = START  # seconds for all processes of a run to find each other
     lease: float = LEASE  # seconds of silence after which a link counts as lost
-    core: int | None = None  # of this host that the process stays on; None: wherever there is room
 
 
 UNWIRED = Wire("", (), ())

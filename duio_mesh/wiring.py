@@ -15,7 +15,6 @@ from typing import Protocol
 from duio_mesh import credentials
 from duio_mesh.errors import ScenarioError
 from duio_mesh.journal import BATCH_BYTES
-from duio_mesh.placement import available, cores
 from duio_mesh.scenario.model import Security
 from duio_mesh.simulation import estimate_sizes
 from duio_mesh.spec import Guard, Wire
@@ -86,8 +85,6 @@ class Wiring:
         self._limit = largest_frame(design)
         self._held: list[socket.socket] = []
         self._links = Links(design, record=record)
-        near = {i: (*spec.hears, *spec.tells) for i, spec in design.nodes.items()}
-        self._cores = {f"node-{i}": core for i, core in cores(near, available()).items()}
 
     def wires(self) -> dict[str, Wire]:
         """The wire of every process; its port is reserved, its credentials are written."""
@@ -103,7 +100,6 @@ class Wiring:
                 listen=(at[who],) if who in at else (),
                 connect=tuple(at[other] for other in dialled),
                 guard=self._guard(who, folders[who]) if who in folders else None,
-                core=self._cores.get(who),
             )
             for who, dialled in dials.items()
         }
