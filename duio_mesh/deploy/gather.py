@@ -49,11 +49,13 @@ def gather(root: Path, sources: Iterable[Path], out: Path | None) -> tuple[Desig
     for path in found:
         if path.suffix == ".jsonl" and (path.stem in sizes or path.stem == "recorder"):
             _log(logs, path, folder)
+    recorder = logs.processes.pop("recorder", None)
     recording = next((path for path in found if path.name == "recording.rrd"), None)
-    if recording and not shortfall:
+    if recorder and not recorder.done:  # when it was killed it could not say so itself
+        shortfall.append("the recorder did not end well; the recording was made from the rows")
+    elif recorder and recording and not shortfall:
+        logs.processes["recorder"] = recorder
         shutil.copyfile(recording, folder.root / "recording.rrd")
-    else:
-        logs.processes.pop("recorder", None)
     failures = [f"{p.who}: {p.failure}" for p in logs.processes.values() if p.failure]
     result = launcher.gather(folder, design, logs, 0.0, "; ".join(failures))
     if not (folder.root / "recording.rrd").exists():

@@ -6,7 +6,8 @@ import json
 from pathlib import Path
 from typing import Any
 
-from duio_mesh.supervisor import Process, Supervisor
+from duio_mesh.diagnosis import Process
+from duio_mesh.supervisor import Supervisor
 
 
 class Logs(Supervisor):
