@@ -5,13 +5,15 @@
 The ring of bench/rings.py, `admm` with 199 rounds a step; N nodes do 4/N of the rounds, so that every run takes about
 as long. All N take turns in shuffled order. The speed is compared as rounds per second times N: on the same cores a
 ring of N has N/4 times the work of a ring of four in every round. The start is from the end of the design to the last
-node's `ready`, with a nursery that came up while the gains were designed, as on the command line.
+node's `ready`, with a nursery that came up while the gains were designed, as on the command line. `pinned`: each part
+of the ring stays on one core from the first step on.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
 import statistics
 import sys
 import tempfile
@@ -24,15 +26,14 @@ from typing import NamedTuple
 import rings
 from interleave import Contenders, Results, interleaved, machine, table
 from page import Page
-from processes import memories
+from processes import PROC, family, memories
 
-from duio_mesh import launcher, placement
+from duio_mesh import launcher
 from duio_mesh.launcher import Progress
 from duio_mesh.supervisor import Supervisor
 
 ROUNDS = 199  # exchanges per step
 REFERENCE = "4 nodes"
-FEW = placement.CROWD
 
 
 class Run(NamedTuple):
@@ -50,15 +51,26 @@ def ready(logs: Path) -> float:
     return max(float(event["time"]) for event in events if event["event"] == "ready")
 
 
+def pin(count: int) -> None:
+    """Let all threads of every node stay on the core of its part of the ring."""
+    cores = sorted(os.sched_getaffinity(0))
+    for who, pid in family().items():
+        if who.startswith("node-"):
+            core = cores[(int(who.removeprefix("node-")) - 1) * len(cores) // count]
+            for thread in (PROC / str(pid) / "task").iterdir():
+                os.sched_setaffinity(int(thread.name), {core})
+
+
 def measure(count: int, steps: int, kind: str, runs: dict[str, list[Run]], name: str) -> float:
-    """Rounds per second of one run, times N; the rest is added to ``runs``. ``kind``: recorded, anywhere, or ""."""
+    """Rounds per second of one run, times N; the rest is added to ``runs``. ``kind``: recorded, pinned, or ""."""
     record = kind == "recorded"
-    placement.CROWD = FEW if kind != "anywhere" else 1 << 30
     sizes: list[float] = []
 
     def look(progress: Progress) -> None:
         if progress.steps and not sizes:
             sizes.extend(size.pss for who, size in memories().items() if who.startswith("node-"))
+            if kind == "pinned":
+                pin(count)
 
     with tempfile.TemporaryDirectory() as out, Supervisor() as supervisor:
         if record:
@@ -91,14 +103,16 @@ def main() -> None:
     parser.add_argument("--nodes", type=int, nargs="*", default=[16, 64, 128], help="beside the ring of 4")
     parser.add_argument("--rounds", type=int, default=20_000, help="of the ring of four; N nodes do 4/N of them")
     parser.add_argument("--record", type=int, nargs="*", default=[64], help="rings that are run with a recorder, too")
-    parser.add_argument("--anywhere", type=int, nargs="*", default=[64], help="rings left to the kernel, on any core")
+    parser.add_argument(
+        "--pinned", type=int, nargs="*", default=[64], help="rings that are cut into parts, a core for each"
+    )
     parser.add_argument("--repeat", type=int, default=5)
     parser.add_argument("--write", action="store_true", help="put the tables into docs/scaling.md")
     args = parser.parse_args()
     page = Page("scaling.md", "rings")
     page.say(f"{machine()}; {args.repeat} repetitions\n")
     runs: dict[str, list[Run]] = {}
-    counts = {"": [4, *args.nodes], "recorded": args.record, "anywhere": args.anywhere}
+    counts = {"": [4, *args.nodes], "recorded": args.record, "pinned": args.pinned}
     results: Results = interleaved(contenders(counts, args.rounds, runs), args.repeat)
     page.say(table("ring", results, REFERENCE, "rounds/s times N"))
     page.say("| ring | rounds/s | ready after, s | PSS of the largest node, MB | the oracle's estimates |")

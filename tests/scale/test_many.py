@@ -12,7 +12,6 @@ from rerun.chunk import RrdReader
 from duio_mesh.console import FEW, MANY, chosen
 from duio_mesh.errors import RunError
 from duio_mesh.limits import check_files
-from duio_mesh.placement import cores
 from duio_mesh.report.pairing import Errors
 from duio_mesh.report.recording import Recording
 from duio_mesh.report.worst import Worst
@@ -69,23 +68,3 @@ def test_a_finished_recording_of_many_nodes_shows_the_worst(tmp_path: Path) -> N
     assert "The 16 worst nodes" in last
     tabs = {i for i in ids if f'"Node {i}"' in last}
     assert tabs == set(range(5, 21))
-
-
-def test_crowded_neighbours_share_a_core() -> None:
-    ring = {i: ((i - 2) % 64 + 1, i % 64 + 1) for i in range(1, 65)}
-    placed = cores(ring, [3, 5])
-    assert sorted(placed.values()) == [3] * 32 + [5] * 32
-    assert sum(placed[i] != placed[j] for i, near in ring.items() for j in near if i < j) <= 4  # edges that cross
-    islands = {i: (i + 1 - 2 * (i % 2 == 0),) for i in range(1, 65)}  # 1-2, 3-4, ...
-    assert sum(placed_apart(cores(islands, [0, 1]), islands)) == 0
-
-
-def test_few_nodes_or_one_core_are_left_to_the_kernel() -> None:
-    ring = {i: ((i - 2) % 8 + 1, i % 8 + 1) for i in range(1, 9)}
-    assert cores(ring, [0, 1]) == {}
-    assert cores(dict.fromkeys(range(64), ()), [0]) == {}
-
-
-def placed_apart(placed: dict[int, int], near: dict[int, tuple[int, ...]]) -> list[bool]:
-    """For every edge, both ways, whether its ends are on different cores."""
-    return [placed[i] != placed[j] for i, js in near.items() for j in js]
