@@ -186,7 +186,7 @@ def loopback(count: int) -> list[str]:
 
 def measure(point: Point, seconds: float, repeat: int, guess: float) -> tuple[Point, list[float]]:
     """The point with its round-trip time as measured, and seconds a round, once per repetition."""
-    rounds = max(20, min(20_000, round(seconds / guess)))
+    rounds = max(50, min(20_000, round(seconds / guess)))
     if not point.wired:
         return point, [seconds_a_round(point, rounds, None) for _ in range(repeat)]
     with Wires(point.nodes, point.rtt / 2) as wires:  # the rate limits bytes, and is counted apart from the time
