@@ -36,6 +36,7 @@ from duio_mesh.wiring import LOOPBACK, Wired, Wiring, check_address
 
 CLOSING = 10.0  # seconds for the recorder to fill gaps and close its file ...
 CLOSING_ROWS = 50_000  # ... and a second more for every so many rows
+BRIEF = 2  # waits that the progress line names
 
 
 @dataclass(frozen=True)
@@ -180,7 +181,7 @@ class Launch:
             estimate = _row(files[i], self._sizes[i], k - 1)
             if x is not None and estimate is not None:
                 errors[i] = float(np.sqrt(np.mean((estimate[:n] - x) ** 2)))
-        show(Progress(self._finished(steps), errors, self._supervisor.note or self._supervisor.waiting()))
+        show(Progress(self._finished(steps), errors, self._supervisor.note or self._supervisor.waiting(BRIEF)))
         return sum(sizes.values())
 
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from duio_mesh.diagnosis import Process
 from duio_mesh.errors import RunError
-from duio_mesh.supervisor import Process, Supervisor
+from duio_mesh.supervisor import Supervisor
 
 TRIES = 3  # processes in a row that may be lost before one of them is back in step
 

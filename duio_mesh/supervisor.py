@@ -14,11 +14,13 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self, TypeAlias
 
+from duio_mesh import diagnosis
+from duio_mesh.diagnosis import Process
 from duio_mesh.errors import RunError
 from duio_mesh.spec import PATIENCE, START
 
@@ -27,57 +29,10 @@ MARGIN = 2.0  # seconds beyond the deadline that a process has for saying itself
 GATHER = 0.3  # seconds after the first failure in which others may say what they saw
 END = 2.0  # seconds for asked processes to end before they are made to
 LONGER = PATIENCE + 1  # deadlines, where lost nodes are survived: their own waits may last PATIENCE of them
-STATES = {"T": "stopped", "t": "stopped by a debugger", "D": "waiting for a disk"}  # of /proc/<pid>/stat
 TOLD = ("lost", "joined", "back", "dying", "pausing", "resumed", "waiting")
 THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
-
-Recover: TypeAlias = "Callable[[Process], bool] | None"
-
-
-class Process:
-    """What is known of one process."""
-
-    def __init__(self, who: str) -> None:
-        self.who = who
-        self.said: dict[str, Any] = {}  # what it reported when it was ready
-        self.done: dict[str, Any] = {}  # its last words when all went well
-        self.failure = ""  # what it says went wrong ...
-        self.lost: Sequence[str] = ()  # ... and whose end was the cause
-        self.code: int | None = None  # exit code; negative is a signal
-        self.warnings: list[str] = []
-        self.pid = 0
-        self.waits: dict[str, Any] = {}  # what it says that it waits for, when that takes long ...
-        self.since = 0.0  # ... since when
-        self.wakes: float | None = None  # it is stopped on purpose until then
-        self.before = 0  # processes of this name before it
-        self.back = False  # it replaces one and is in step
-        self.there = True  # False: the run goes on without it
-
-    @property
-    def essential(self) -> bool:
-        """A run does without its recorder."""
-        return self.who != "recorder"
-
-    def death(self) -> str:
-        """How it ended, in words."""
-        if self.code is not None and self.code < 0:
-            return f"{self.who} was killed by {signal.Signals(-self.code).name}"
-        return self.failure or f"{self.who} ended with exit code {self.code}"
-
-    def waiting(self) -> str:
-        """What it waits for, in words."""
-        on, link, k, r = (self.waits[key] for key in ("on", "link", "k", "r"))
-        at = f"{link}, step {k}, round {r}" if link else f"step {k}"
-        return f"{self.who} waits for {' and '.join(on)} ({at})"
-
-    def state(self) -> str:
-        """What the operating system says that it is doing; "" when that is nothing special or cannot be told."""
-        try:
-            stat = Path(f"/proc/{self.pid}/stat").read_text()
-        except OSError:
-            return ""
-        return STATES.get(stat.rpartition(")")[2].split()[0], "")
+Recover: TypeAlias = Callable[[Process], bool] | None
 
 
 class Supervisor:
@@ -158,8 +113,8 @@ class Supervisor:
                     since = time.monotonic()
             if any(p.code or (p.failure and not self._recovers(p, recover)) for p in self._essential()):
                 self._until(lambda: False, GATHER)
-                self._until(lambda: not self._owing(), END)
-                raise RunError(self._diagnosis())
+                self._until(lambda: not diagnosis.owing(self.processes), END)
+                raise RunError(diagnosis.first_cause(self.processes))
             if self.source_done():
                 self._end_the_late()
             now = time.monotonic()
@@ -191,33 +146,18 @@ class Supervisor:
                 p.warnings.append("the run was over before it was back in step")
                 self.kill(p.who, signal.SIGKILL)
 
-    def waiting(self) -> str:
-        """Who waits for whom, and what the operating system says of those who keep others waiting; "" when nobody."""
-        waits = [p.waiting() for p in self._essential() if p.waits]
-        waits += [f"{p.who} is {p.state()}" for p in self._roots() if p.state()]
-        return "; ".join(waits)
+    def waiting(self, few: int = diagnosis.FEW) -> str:
+        """Who waits for whom, in words (``diagnosis.in_words``)."""
+        return diagnosis.in_words(self.processes, few)
 
     def _who_waits(self) -> str:
         return f" ({words})" if (words := self.waiting()) else ""
 
-    def _roots(self) -> list[Process]:
-        """Those that others wait for and who do not wait themselves, or only think so: they are stopped."""
-        found: dict[str, Process] = {}
-        for p in self._essential():
-            for who in p.waits.get("on", ()):
-                other = self._named(who)
-                if other.there and (not other.waits or other.state()):
-                    found[who] = other
-        return list(found.values())
-
     def _end_the_stuck(self, deadline: float) -> None:
         """Kill who has kept the others waiting for longer than the deadline: then it is lost, for certain."""
-        now = time.monotonic()
-        late = [p for p in self._essential() if p.waits and now - p.since > deadline]
-        for p in self._roots() if late else ():
-            if p.who.startswith("node-") and any(p.who in other.waits["on"] for other in late) and p.code is None:
-                p.warnings.append(f"kept {', '.join(o.who for o in late)} waiting for {deadline:g} s; killed")
-                self.kill(p.who, signal.SIGKILL)
+        for p, others in diagnosis.culprits(self.processes, deadline, time.monotonic()):
+            p.warnings.append(f"kept {diagnosis.some(others)} waiting for {deadline:g} s; killed")
+            self.kill(p.who, signal.SIGKILL)
 
     def _wake(self) -> None:
         """Continue those that were stopped on purpose, until they say that they have felt it."""
@@ -246,25 +186,7 @@ class Supervisor:
         return (deadline if started else START) + MARGIN
 
     def _essential(self) -> list[Process]:
-        return [p for p in self.processes.values() if p.essential and p.there]
-
-    def _owing(self) -> list[Process]:
-        """Processes that others have lost and that have not said yet why they ended."""
-        named = {who for p in self._essential() for who in p.lost}
-        return [p for p in map(self._named, sorted(named)) if not p.failure and p.code is None]
-
-    def _named(self, who: str) -> Process:
-        """A process as the others call it: a gateway is the plant to them."""
-        return self.processes.get(who) or self.processes["gateway"]
-
-    def _diagnosis(self) -> str:
-        """Who was the first cause: a killed process before one that failed by itself, before one that lost a peer."""
-        killed = [p.death() for p in self._essential() if p.code and p.code < 0]
-        failed = [p.failure for p in self._essential() if p.failure]
-        first = [p.failure for p in self._essential() if p.failure and not p.lost]
-        then = [text for text in failed if text not in first]
-        stopped = [f"{p.who} is {p.state()}" for p in self._roots() if p.state()]
-        return "; ".join(killed + first + then + stopped) or "; ".join(p.death() for p in self._essential() if p.code)
+        return diagnosis.essential(self.processes)
 
     def _until(self, done: Callable[[], bool], timeout: float) -> None:
         end = time.monotonic() + timeout
@@ -292,32 +214,10 @@ class Supervisor:
                 self._hear(json.loads(line))
 
     def _hear(self, event: dict[str, Any]) -> None:
-        process, what = self.processes[event["who"]], event["event"]
         self._beats += 1
-        if what == "ready":
-            process.said = event
-        elif what == "done":
-            process.done = event
-        elif what == "failed":
-            process.failure, process.lost = event["text"], event.get("lost", ())
-        elif what == "sensors":
+        self.processes[event["who"]].hear(event, time.monotonic())
+        if (what := event["event"]) == "sensors":
             self.note = event["text"]
-        elif what == "warning":
-            process.warnings.append(event["text"])
-        elif what == "started":
-            process.pid = event["pid"]
-        elif what == "waiting":
-            process.waits, process.since = event, time.monotonic() - event["waited"]
-        elif what == "moving":
-            process.waits = {}
-        elif what == "pausing":
-            process.wakes = time.monotonic() + event["seconds"]
-        elif what == "resumed":
-            process.wakes = None
-        elif what == "back":
-            process.back = True
-        elif what == "exit":
-            process.code, process.waits = event["code"], {}
         if what in TOLD:
             self.remember(what, **{key: value for key, value in event.items() if key != "event"})
 
