@@ -53,9 +53,8 @@ def configured(wire: Wire) -> zenoh.Config:
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
         "transport/shared_memory/enabled": False,
-        # through routers, one queue per link: with one per priority, the news that somebody has gone may overtake the
-        # last that it had sent
-        "transport/unicast/qos/enabled": wire.mode == "peer",
+        # one queue per link: with one per priority, the news that somebody has gone may overtake the last that it said
+        "transport/unicast/qos/enabled": False,
         **security.settings(wire),
     }
     for key, value in settings.items():
