@@ -6,7 +6,7 @@ Nothing is done here and nobody is asked; only ``Process.state`` looks at what t
 from __future__ import annotations
 
 import signal
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -26,6 +26,7 @@ class Process:
         self.code: int | None = None  # exit code; negative is a signal
         self.warnings: list[str] = []
         self.pid = 0
+        self.born = 0.0  # on the clock of ``hear``
         self.waits: dict[str, Any] = {}  # what it says that it waits for, when that takes long ...
         self.since = 0.0  # ... since when
         self.wakes: float | None = None  # it is stopped on purpose until then
@@ -45,7 +46,7 @@ class Process:
         elif what == "warning":
             self.warnings.append(event["text"])
         elif what == "started":
-            self.pid = event["pid"]
+            self.pid, self.born = event["pid"], now
         elif what == "waiting":
             self.waits, self.since = dict(event), now - event["waited"]
         elif what == "moving":
@@ -83,6 +84,10 @@ class Process:
         except OSError:
             return ""
         return STATES.get(stat.rpartition(")")[2].split()[0], "")
+
+    def stopped(self) -> bool:
+        """Whether a signal or a debugger has stopped it."""
+        return self.code is None and bool(self.pid) and self.state().startswith("stopped")
 
 
 Processes: TypeAlias = Mapping[str, Process]
@@ -129,11 +134,14 @@ def in_words(processes: Processes, few: int = FEW) -> str:
 
 
 def culprits(processes: Processes, deadline: float, now: float) -> list[tuple[Process, list[str]]]:
-    """Nodes that have kept others waiting for longer than ``deadline`` seconds, and who has waited so long."""
+    """Nodes that have kept others waiting for longer than ``deadline`` seconds, and who has waited so long.
+
+    Not one that has just taken the place of another, for which they had waited.
+    """
     late = [p for p in essential(processes) if p.waits and now - p.since > deadline]
     causes = roots(processes) if late else []
     nodes = [p for p in causes if p.who.startswith("node-") and any(p.who in other.waits["on"] for other in late)]
-    return [(p, [other.who for other in late]) for p in nodes if p.code is None]
+    return [(p, [other.who for other in late]) for p in nodes if p.pid and p.code is None and now - p.born > deadline]
 
 
 def owing(processes: Processes) -> list[Process]:
@@ -150,9 +158,12 @@ def first_cause(processes: Processes) -> str:
     failed = [p.failure for p in there if p.failure]
     first = [p.failure for p in there if p.failure and not p.lost]
     then = [text for text in failed if text not in first]
-    return "; ".join([*killed, *first, *then, *_states(roots(processes))]) or "; ".join(
-        p.death() for p in there if p.code
-    )
+    return "; ".join([*killed, *first, *then, *stopped(processes)]) or "; ".join(p.death() for p in there if p.code)
+
+
+def stopped(processes: Processes, but: Collection[Process] = ()) -> list[str]:
+    """Who is stopped, whether somebody waits for it or not; in words."""
+    return _states(p for p in essential(processes) if p not in but and p.stopped())
 
 
 def _states(processes: Iterable[Process]) -> list[str]:

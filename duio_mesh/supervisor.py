@@ -124,7 +124,7 @@ class Supervisor:
                 seen, since = news, now
             if recover:
                 self._end_the_stuck(deadline)
-            if now - since > self._allowed(deadline) * (LONGER if recover else 1):
+            if self._stuck(now - since, deadline, LONGER if recover else 1):
                 stuck = ", ".join(p.who for p in self._essential() if not p.done)
                 raise RunError(f"nothing has moved for {now - since:.1f} s; not finished: {stuck}{self._who_waits()}")
         look()
@@ -151,7 +151,8 @@ class Supervisor:
         return diagnosis.in_words(self.processes, few)
 
     def _who_waits(self) -> str:
-        return f" ({words})" if (words := self.waiting()) else ""
+        words = [self.waiting(), *diagnosis.stopped(self.processes, but=diagnosis.roots(self.processes))]
+        return f" ({'; '.join(filter(None, words))})" if any(words) else ""
 
     def _end_the_stuck(self, deadline: float) -> None:
         """Kill who has kept the others waiting for longer than the deadline: then it is lost, for certain."""
@@ -166,11 +167,13 @@ class Supervisor:
                 self.kill(p.who, signal.SIGCONT)
 
     def finish(self, who: str, timeout: float) -> bool:
-        """Ask a process to finish and wait for its end; whether it ended well."""
+        """Ask a process to finish and wait for its end, unless it is stopped; whether it ended well."""
         process = self.processes[who]
         if process.code is None:
             self.kill(who, signal.SIGTERM)
-            self._until(lambda: process.code is not None, timeout)
+            end = time.monotonic() + timeout
+            while process.code is None and time.monotonic() < end and not process.stopped():
+                self._until(lambda: process.code is not None, FRAME)
         return bool(process.done) and process.code is not None
 
     def end(self) -> None:
@@ -181,9 +184,12 @@ class Supervisor:
                     self.kill(p.who, number)
             self._until(lambda: all(p.code is not None for p in self.processes.values()), END)
 
-    def _allowed(self, deadline: float) -> float:
-        started = all(p.said for p in self._essential())
-        return (deadline if started else START) + MARGIN
+    def _stuck(self, still: float, deadline: float, times: int) -> bool:
+        """Whether so many seconds without news are too many; a start may take longer, unless somebody is stopped."""
+        if still <= (deadline + MARGIN) * times:
+            return False
+        started = all(p.said for p in self._essential()) or diagnosis.stopped(self.processes)
+        return bool(started) or still > (START + MARGIN) * times
 
     def _essential(self) -> list[Process]:
         return diagnosis.essential(self.processes)
