@@ -55,6 +55,7 @@ def run(spec: PlantSpec, report: Report) -> None:
             while done < spec.steps and (step := inlet.next(credits)) is not None:
                 if not done:
                     begin = time.monotonic()  # the first may take its time
+                credits.collect()
                 credits.wait(done + 1 - spec.window)
                 if back := credits.admit(done):
                     admit(samples, done, back, credits.away, rows)

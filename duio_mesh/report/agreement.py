@@ -10,6 +10,8 @@ set of steps, both as the RMS per component:
 
 Small figures do not prove that the estimates are right: all nodes may be wrong together where nobody measures. Large
 ones prove that something is wrong: the model, a sensor, or an input that is driven and that nobody counts with.
+
+In a run that goes on without a lost node, only the estimates that there are count, in both figures and in the mean.
 """
 
 from __future__ import annotations
@@ -27,15 +29,20 @@ AGREE, DISAGREE, INCOMPLETE = "the nodes agree", "the nodes do not agree", "inco
 
 
 def agreement(trace: Trace, scenario: Scenario, steps: slice) -> dict[int, dict[str, float]]:
-    """Node -> {"disagreement", "residual"} over these steps; NaN where any row is missing or there is no step."""
+    """Node -> {"disagreement", "residual"} over these steps; NaN where a row is missing or there is none."""
     figures = {}
+    there = ~trace.lost[:, steps]
+    xhat = np.where(there[:, :, None], trace.xhat[:, steps], 0.0)
     with np.errstate(over="ignore", invalid="ignore"):
-        middle = trace.xhat[:, steps].mean(axis=0) if trace.xhat.shape[1] else trace.xhat[0]
+        middle = xhat.sum(axis=0) / np.maximum(there.sum(axis=0), 1)[:, None]
         for at, i in enumerate(trace.node_ids.tolist()):
-            C, own = scenario.nodes[i].C, trace.xhat[at, steps]
-            y = trace.samples[i][steps, : C.shape[0]]
-            others = np.delete(trace.xhat[:, steps], at, axis=0) if len(trace.node_ids) > 1 else own[None]
-            figures[i] = {"disagreement": _rms(own - middle), "residual": _rms(y - others @ C.T)}
+            C, own, others = scenario.nodes[i].C, there[at], there.copy()
+            others[at] = not np.delete(there, at, axis=0).any()  # alone, it has only itself
+            missed = trace.samples[i][steps, : C.shape[0]] - xhat @ C.T
+            figures[i] = {
+                "disagreement": _rms((xhat[at] - middle)[own]),
+                "residual": _rms(missed[others & own]),
+            }
     return figures
 
 

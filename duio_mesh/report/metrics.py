@@ -37,7 +37,7 @@ def metrics(trace: Trace, scenario: Scenario, counts: Mapping[str, Any]) -> dict
     Where messages can be missing, a node also has what ``presence`` says; of one that was away, ``rms`` is over the
     steps that there are, ``final`` of its last estimate, and the verdict over the nodes that are there at the end.
     ``remarks`` are what has to be said beside the verdict, ``recovery`` how long the errors were larger after each loss
-    (``report/recovery.py``).
+    (``report/recovery.py``; not without a truth).
     """
     wanted = scenario.run.convergence
     window = judged(trace, wanted)
@@ -55,13 +55,17 @@ def metrics(trace: Trace, scenario: Scenario, counts: Mapping[str, Any]) -> dict
         str(i): {"rms": _finite(rms[at]), "final": _finite(final[at])} | own.get(i, {}) for at, i in enumerate(ids)
     }
     if scenario.outside:
-        complete = len(trace.t) > 0 and not counts.get("failure") and not np.isnan(trace.xhat).any()
+        complete = len(trace.t) > 0 and not counts.get("failure") and _whole(trace)
         figures = agreement(trace, scenario, window)
-        said = verdict(figures, wanted.rms_below, complete=complete)
+        there = dict(zip(ids, present(trace).tolist(), strict=True))
+        judging = {i: found for i, found in figures.items() if there[i]}
+        said = verdict(judging, wanted.rms_below, complete=complete)
         for i, found in figures.items():
             nodes[str(i)] |= {name: _finite(value) for name, value in found.items()}
     if trace.flagged is not None:
-        said |= {"remarks": remarks(trace), "recovery": recovery(trace)}
+        said |= {"remarks": remarks(trace)}
+        if not scenario.outside:  # nobody knows an error
+            said |= {"recovery": recovery(trace)}
     return {
         **said,
         "criterion": {"rms_below": wanted.rms_below, "from_step": window.start},

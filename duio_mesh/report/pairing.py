@@ -110,7 +110,10 @@ class Pairing:
 
 
 class Middle(Pairing):
-    """In the truth's place, where nobody knows it, the mean of all estimates: a step is known when all are here."""
+    """In the truth's place, where nobody knows it, the mean of all estimates: a step is known when all are here.
+
+    Or when it is certain that no further one comes.
+    """
 
     def together(self, node: int, k: int, rows: Array) -> list[Errors]:
         """Estimates (m, n) of the steps from k on: all nodes' distances in the steps that are complete with them."""
@@ -119,12 +122,25 @@ class Middle(Pairing):
             part = rows[first : first + self.window]
             steps = np.arange(k + first, k + first + len(part))
             self._early[node].put(steps, part)
-            whole = steps[np.all([ring.has(steps) for ring in self._early.values()], axis=0)]
-            if len(whole):
-                with np.errstate(over="ignore", invalid="ignore"):
-                    middle = np.mean([ring.get(whole) for ring in self._early.values()], axis=0)
-                for at, upto in runs(whole):
-                    said += self.truth(at, middle[np.searchsorted(whole, at) :][: upto - at])
+            said += self._close(steps[np.all([ring.has(steps) for ring in self._early.values()], axis=0)])
+        return said
+
+    def rest(self, first: int, last: int) -> list[Errors]:
+        """No further estimate of the steps first .. last-1 comes: the distances of those that are here."""
+        steps = np.arange(first, last)
+        return self._close(steps[np.any([ring.has(steps) for ring in self._early.values()], axis=0)])
+
+    def _close(self, steps: NDArray[np.int64]) -> list[Errors]:
+        """The distances of these steps' estimates from their mean."""
+        total, count = np.zeros((len(steps), self._n)), np.zeros((len(steps), 1))
+        with np.errstate(over="ignore", invalid="ignore"):
+            for ring in self._early.values():
+                there = ring.has(steps)[:, None]
+                total, count = total + np.where(there, ring.get(steps), 0.0), count + there
+            middle = total / count
+        said = []
+        for at, upto in runs(steps):
+            said += self.truth(at, middle[np.searchsorted(steps, at) :][: upto - at])
         return said
 
 

@@ -181,6 +181,8 @@ class Recording:
                 self._give(None, k, truth[k : k + window])
                 for i, rows in estimates.items():
                     self._give(i, k, rows[k : k + window])
+                for errors in self._middle.rest(k, min(k + window, self._spec.steps)) if self._middle else ():
+                    self._say(errors)
 
     def close(self) -> None:
         """Mark what is still missing, write everything and the footer. Raises OSError when the disk would not take it.

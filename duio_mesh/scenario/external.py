@@ -89,8 +89,6 @@ def _check_run(document: Mapping[str, Any], hold: float | None, problems: Proble
     run, timing = document.get("run"), document.get("timing")
     if isinstance(run, Mapping) and run.get("batch", 1) != 1:
         problems.at(("run", "batch"), "should be 1: samples from outside come one by one")
-    if isinstance(run, Mapping) and run.get("on_node_loss", "stop") != "stop":
-        problems.at(("run", "on_node_loss"), "should be stop: a gateway cannot go back to old samples")
     deadline = run.get("deadline", schema.Run.model_fields["deadline"].default) if isinstance(run, Mapping) else inf
     if hold is not None and isinstance(deadline, int | float) and hold >= deadline:
         problems.at((*EXTERNAL, "hold"), f"should be less than run.deadline, {deadline:g} s, when the run fails")

@@ -48,12 +48,12 @@ def _in_reach(design: Design) -> Design:
     run, spec = design.scenario.run, next(iter(design.nodes.values()))
     rounds = make_observer(spec).rounds
     flow = flow_control(run, run.window // rounds)
+    block = 1 if design.scenario.outside else flow.quarter
     return replace(
         design,
-        plant=replace(design.plant, window=flow.window, block=flow.quarter),
+        plant=replace(design.plant, window=flow.window, block=block),
         nodes={
-            i: replace(node, window=flow.window, credit=flow.quarter, block=flow.quarter)
-            for i, node in design.nodes.items()
+            i: replace(node, window=flow.window, credit=flow.quarter, block=block) for i, node in design.nodes.items()
         },
     )
 

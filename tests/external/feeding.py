@@ -37,9 +37,9 @@ def base() -> Design:
     return duio_mesh.synthesise(duio_mesh.load_scenario(TOPOLOGY))
 
 
-def design(security: str = "open", **changes: Any) -> tuple[Design, str]:
-    """The example's design on a port of its own (and that endpoint); ``changes`` are of the spec's ``outside``."""
-    made, endpoint = base(), f"tcp/127.0.0.1:{free_port()}"
+def design(security: str = "open", given: Design | None = None, **changes: Any) -> tuple[Design, str]:
+    """The example's (or the given) design on a port of its own, and that endpoint; ``changes`` are of ``outside``."""
+    made, endpoint = given or base(), f"tcp/127.0.0.1:{free_port()}"
     assert made.plant.outside is not None
     outside = replace(made.plant.outside, listen=endpoint, **changes)
     scenario = replace(made.scenario, outside=outside, security=made.scenario.security._replace(mode=security))

@@ -18,6 +18,8 @@ NOW = 1000.0  # seconds
 def waiting(waits: Mapping[str, Sequence[str]], *others: str) -> dict[str, Process]:
     """Processes of which some wait: since five seconds, in step 7, the nodes on an edge, the plant on nobody's."""
     found = {who: Process(who) for who in (*waits, *others)}
+    for process in found.values():
+        process.hear({"event": "started", "pid": os.getpid()}, 0.0)  # running, like this one
     for who, on in waits.items():
         link = "" if who == "plant" else f"edge {on[0][5:]} -> {who[5:]}"
         found[who].hear({"event": "waiting", "on": on, "link": link, "k": 7, "r": 1, "waited": 5.0}, NOW)
