@@ -134,6 +134,8 @@ class Launch:
     def go(self, show: Show, watcher: Watcher | None) -> None:
         """Start everybody and stay until plant and nodes are done. Raises RunError, or KeyboardInterrupt."""
         try:
+            if not self._design.scenario.security.keep:
+                self._supervisor.forget(self._folder.keys)  # before there is anything in it
             run, specs = self._design.scenario.run, self.specs()
             for who, spec in specs.items():
                 write_spec(spec, self._folder.spec(who))

@@ -2,7 +2,8 @@
 
 It has imported numpy, Zenoh and the node's code once, and forks from there: a node starts in milliseconds and shares
 those pages. (No Zenoh session is ever open in the nursery: a fork would inherit a dead one.) The launcher speaks to it
-over a socket, one JSON line a message. When the launcher goes, however it goes, the nursery ends everybody.
+over a socket, one JSON line a message. When the launcher goes, however it goes, the nursery ends everybody, and then
+removes what the launcher would have removed: the credentials of the run.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ import duio_mesh.gateway
 import duio_mesh.node
 import duio_mesh.observers
 import duio_mesh.plant
+from duio_mesh import credentials
 from duio_mesh.process import Report, live
 from duio_mesh.spec import NodeSpec, PlantSpec, RecorderSpec
 
@@ -57,6 +59,7 @@ class Nursery:
         self._control, self._status = control, status
         self._children: dict[int, str] = {}  # pid -> who
         self._prepared: dict[str, int] = {}  # who -> pipe on which it waits for its order
+        self._secrets: list[Path] = []  # folders that nobody needs when everybody has ended
 
     def serve(self) -> None:
         """Obey the launcher until it closes its end; then end what still runs."""
@@ -80,8 +83,13 @@ class Nursery:
                 for line in lines:
                     self._obey(json.loads(line))
         self._end_all(wake_read)
+        for folder in self._secrets:
+            credentials.remove(folder)
 
     def _obey(self, order: dict[str, Any]) -> None:
+        if "secrets" in order:
+            self._secrets.append(Path(order["secrets"]))
+            return
         who = order["who"]
         if "prepare" in order:
             read, self._prepared[who] = os.pipe()

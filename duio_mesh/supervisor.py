@@ -89,6 +89,10 @@ class Supervisor:
         fresh.before, fresh.warnings = before.before + 1, before.warnings
         self.start(who, kind, spec, log, errors)
 
+    def forget(self, secrets: Path) -> None:
+        """Have this folder removed when everybody has ended, even if this process does not live to see it."""
+        self._order({"secrets": str(secrets)})
+
     def kill(self, who: str, number: int) -> None:
         """Send a signal to one process."""
         self._order({"who": who, "signal": number})

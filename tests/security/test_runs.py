@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
+import signal
 import stat
 from pathlib import Path
 
+import psutil
 import pytest
 
 import duio_mesh
 from duio_mesh import launcher
 from duio_mesh.errors import ScenarioError
 from duio_mesh.scenario.model import Security
+from tests.conftest import started_in, wait_for
+from tests.processes.running import Running
 from tests.security.rogue import design_of
 
 pytestmark = [pytest.mark.mesh, pytest.mark.usefixtures("nothing_left")]
@@ -80,3 +84,36 @@ def test_a_failed_run_leaves_no_credentials_either(monkeypatch: pytest.MonkeyPat
         launcher.run(design_of("mtls", steps=100_000), "run", record=False, show=look)
     assert seen == [True]
     assert not (Path("run") / "keys").exists()
+
+
+PROCESSES = ("plant", *(f"node-{i}" for i in (1, 2, 3, 4)))
+
+
+def gone(pid: int) -> bool:
+    return not psutil.pid_exists(pid) or psutil.Process(pid).status() == psutil.STATUS_ZOMBIE
+
+
+@pytest.mark.parametrize("mode", ["mtls", "password"])
+def test_a_killed_launcher_leaves_no_credentials(mode: str) -> None:
+    """Not even when a process does not feel that it shall end; and nobody loses its own before it has ended."""
+    with Running("ring.yaml", "--no-record", "--set", f"security={mode}") as run:
+        run.until_row("node-1", 100)
+        keys = run.out / "keys"
+        assert {path.name for path in keys.iterdir()} == set(PROCESSES)
+        pids = [run.pid(who) for who in PROCESSES]
+        run.send("node-3", signal.SIGSTOP)
+        run.send("launcher", signal.SIGKILL)
+        wait_for(lambda: not (keys / "node-1").exists())
+        assert all(gone(pid) for pid in pids)
+        assert run.end() == -signal.SIGKILL  # the nursery, which holds our pipes, has ended too
+    assert not keys.exists()
+    assert secrets_in(run.out) == []
+
+
+def test_a_killed_launcher_leaves_credentials_where_that_is_wanted() -> None:
+    with Running("ring.yaml", "--no-record", "--set", "security={mode: mtls, keep: true}") as run:
+        run.until_row("node-1", 100)
+        run.send("launcher", signal.SIGKILL)
+        run.end()
+        wait_for(lambda: not started_in(run.out.parent))
+    assert len(secrets_in(run.out / "keys")) == len(PROCESSES)
