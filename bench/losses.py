@@ -134,9 +134,8 @@ def main() -> int:
             good["freeze" if case.freeze else "kill"] += not problem
             print(f"{number + 1:4} {case}: {problem or 'ok'}", flush=True)
             bad += [f"{case}: {problem}"] if problem else []
-    print(
-        f"seed {args.seed}: {good['kill']} of {args.kills} kills and {good['freeze']} of {args.freezes} freezes survived"
-    )
+    kills, freezes = f"{good['kill']} of {args.kills} kills", f"{good['freeze']} of {args.freezes} freezes"
+    print(f"seed {args.seed}: {kills} and {freezes} survived")
     return 1 if bad else 0
 
 

@@ -1,142 +1,110 @@
-"""What each observer makes of faults, in the oracle: the table of docs/reliability.md.
+"""What each observer makes of each kind of fault: the table of docs/reliability.md.
 
-    python bench/reliability.py            print the table
-    python bench/reliability.py --write    and put it into docs/reliability.md
+    python bench/reliability.py            print the table, from the oracle: two minutes of CPU time
+    python bench/reliability.py --mesh     and run every cell as processes over Zenoh, too: it has to give the same bits
+    python bench/reliability.py --write    put the table into docs/reliability.md
+    python bench/reliability.py --only relaxed    only cases whose name has this in it
 
-Ends with exit code 1 when an estimate is wrong and not flagged. Same seeds, same bits; takes a minute of CPU time.
+Ends with exit code 1 when an estimate is wrong and not flagged, or when the mesh does not equal the oracle. Same seeds,
+same bits. The runs, the faults and how they are judged: bench/fault_cells.py.
 """
 
 from __future__ import annotations
 
+import argparse
+import math
 import sys
-from collections.abc import Iterator
-from pathlib import Path
-from typing import Any, NamedTuple
+import time
 
-import numpy as np
+from fault_cells import CASES, SEED, Cell, cells
+from page import Page
 
-from duio_mesh import load_scenario, simulate, synthesise
-from duio_mesh.simulation import Trace
-
-ROOT = Path(__file__).parent.parent
-PAGE, BEGIN, END = ROOT / "docs" / "reliability.md", "<!-- table -->\n", "<!-- end of table -->\n"
-SEED = 2026  # of the faults; plant and noise keep the topology's own seed
-
-RUNS: list[tuple[str, str, dict[str, Any]]] = [  # what to call it, topology, changes
-    ("lmi, ring", "ring", {}),
-    ("lmi, star", "star", {}),
-    ("lmi, two islands", "partitioned", {}),
-    ("lmi, unstable plant, ring", "six_state_ring", {"plant.noise": 0, "run.convergence.rms_below": 0.1}),
-    ("lmi, the same, hold", "six_state_ring",
-     {"plant.noise": 0, "run.convergence.rms_below": 0.1, "observer.without": "hold"}),
-    ("augmented, path", "augmented_example9", {}),
-    ("augmented, ring", "augmented_six_state", {}),
-    ("admm, ring", "admm_ring", {"run.steps": 60}),
-    ("admm finite_time, ring", "finite_time_ring", {"run.steps": 300, "observer.setup": "global"}),
-    ("admm relaxed, ring", "relaxed_ring", {"run.steps": 60}),
-    ("geometric, ring", "geometric_ring", {}),
-    ("geometric, ring, pair", "geometric_ring", {"observer.without": "pair"}),
-    ("reduced_order, ring", "reduced_order_kundur8", {}),
-    ("reduced_order, ring, pair", "reduced_order_kundur8", {"observer.without": "pair"}),
-]  # fmt: skip
-LINKS: dict[str, dict[str, Any]] = {
-    "loss 1 %": {"loss": 0.01},
-    "loss 5 %": {"loss": 0.05},
-    "loss 20 %": {"loss": 0.2},
-    "bursts": {"gilbert_elliott": {"worsen": 0.01, "mend": 0.25}},
-    "half of them 1 step late": {"delay": {"steps": [0, 1]}},
-    "delay 1 step": {"delay": {"steps": 1}},
-    "delay 3 steps": {"delay": {"steps": 3}},
-    "duplicates 20 %": {"duplicate": 0.2},
-    "reordering 5 %": {"reorder": 0.05},
-    "corruption 1 %": {"corrupt": 0.01},
+KINDS = {  # of faults: what is said above their table
+    "losses": "Lost frames",
+    "delays": "Late frames",
+    "frames": "Duplicates, reordering, corruption",
+    "cuts": "Partition and heal",
+    "processes": "Killed and stopped processes",
 }
 
 
-class Cell(NamedTuple):
-    """One run: RMS errors per component of the state over the last part of the run that the verdict looks at."""
-
-    run: str
-    fault: str
-    rms: float  # of the worst node
-    clean: float  # the same without faults
-    flagged: float  # share of all estimates
-    trusted: float  # RMS of the worst node over its estimates that are not flagged; NaN when there are none
-    recovery: int | None  # steps after a cut until every error stays below twice the worst of the fault-free run
-    verdict: str
+def verdict(cell: Cell) -> str:
+    """In the tables."""
+    return "**MESH DIFFERS**" if cell.same is False else cell.verdict
 
 
-def errors(trace: Trace) -> Any:
-    """(N, K): RMS over the components of the state."""
-    return np.sqrt(np.mean((trace.xhat - trace.x) ** 2, axis=2))
+def overview(found: list[Cell]) -> str:
+    """The verdicts alone: a row per case, a column per fault."""
+    faults = list(dict.fromkeys(c.fault for c in found))
+    said = {(c.case, c.fault): verdict(c) for c in found}
+    lines = [f"| | {' | '.join(faults)} |", "|---" * (len(faults) + 1) + "|"]
+    for case in dict.fromkeys(c.case for c in found):
+        lines.append(f"| {case} | {' | '.join(said.get((case, fault), '') for fault in faults)} |")
+    return "\n".join(lines)
 
 
-def cells() -> Iterator[Cell]:
-    """Every run under every fault."""
-    for name, topology, changes in RUNS:
-        path = ROOT / "topologies" / f"{topology}.yaml"
-        scenario = load_scenario(path, **changes)
-        steps, arcs = scenario.run.steps, scenario.graph.arcs
-        clean = errors(simulate(synthesise(scenario)))
-        hub = max(scenario.graph.ids, key=lambda i: len(scenario.graph.hears(i)))
-        during = [steps // 4, steps // 2]
-        faults: dict[str, dict[str, Any]] = {fault: {"links": [link]} for fault, link in LINKS.items()}
-        one = [[arcs[0].source, arcs[0].target]]
-        alone = [[hub, j] for j in scenario.graph.hears(hub)]
-        faults["one edge cut, healed"] = {"cuts": [{"edges": one, "during": during}]}
-        faults["one node cut off, healed"] = {"cuts": [{"edges": alone, "during": during}]}
-        for fault, entry in faults.items():
-            trace = simulate(synthesise(load_scenario(path, **changes, faults=entry | {"seed": SEED})))
-            healed = during[1] if "cuts" in entry else None
-            yield judged(name, fault, trace, clean, scenario.run.convergence, healed)
-
-
-def judged(name: str, fault: str, trace: Trace, clean: Any, wanted: Any, healed: int | None) -> Cell:
-    """right: converged as the topology asks. flagged: not so, but the estimates without a flag are. Else WRONG."""
-    e, flags = errors(trace), trace.flagged
-    assert flags is not None
-    last = slice(-round(e.shape[1] * wanted.over_last), None)
-    rms = float(np.sqrt(np.mean(e[:, last] ** 2, axis=1)).max())
-    kept = [np.sqrt(np.mean(row[~f] ** 2)) for row, f in zip(e[:, last], flags[:, last], strict=True) if not f.all()]
-    trusted = float(max(kept, default=np.nan))
-    recovery = None
-    if healed is not None:
-        bad = np.nonzero((e[:, healed:] > 2 * clean[:, last].max()).any(axis=0))[0]
-        recovery = int(bad[-1]) + 1 if len(bad) else 0
-    wrong = not (np.isnan(trusted) or trusted < wanted.rms_below)
-    verdict = "right" if rms < wanted.rms_below else "**WRONG**" if wrong else "flagged"
-    ideal = float(np.sqrt(np.mean(clean[:, last] ** 2, axis=1)).max())
-    return Cell(name, fault, rms, ideal, float(flags.mean()), trusted, recovery, verdict)
-
-
-def table(found: list[Cell]) -> str:
-    """In Markdown."""
+def details(kind: str, found: list[Cell]) -> str:
+    """A row per cell of one kind."""
     lines = [
-        f"Seed of the faults {SEED}; plant and noise as in the topology files (seed 0).",
+        f"<details><summary>{KINDS[kind]}: {len(found)} cells</summary>",
         "",
-        "| run | fault | RMS | without faults | flagged | RMS not flagged | steps to recover | verdict |",
-        "|---|---|---|---|---|---|---|---|",
+        "| run | fault | error during it | at the end | without it | flagged | not flagged | steps to recover "
+        "| trusted again | verdict | mesh = oracle |",
+        "|---" * 11 + "|",
     ]
     for c in found:
-        trusted = "none" if np.isnan(c.trusted) else f"{c.trusted:.1e}"
-        recovery = "" if c.recovery is None else str(c.recovery)
+        numbers = " | ".join("none" if math.isnan(e) else f"{e:.1e}" for e in (c.during, c.final, c.clean))
+        trusted = "none" if math.isnan(c.trusted) else f"{c.trusted:.1e}"
+        steps, doubted = ("never" if k is None else str(k) for k in (c.steps, c.doubted))
+        same = {True: "yes", False: "**no**", None: "not run"}[c.same]
         lines.append(
-            f"| {c.run} | {c.fault} | {c.rms:.1e} | {c.clean:.1e} | {100 * c.flagged:.0f} % | {trusted} | {recovery} "
-            f"| {c.verdict} |"
+            f"| {c.case} | {c.fault} | {numbers} | {100 * c.flagged:.0f} % | {trusted} | {steps} | {doubted} "
+            f"| {verdict(c)} | {same} |"
         )
-    return "\n".join(lines) + "\n"
+    return "\n".join([*lines, "", "</details>"])
 
 
-def main(argv: list[str]) -> int:
-    """Print the table, write it if asked."""
-    found = list(cells())
-    text = table(found)
-    sys.stdout.write(text)
-    if "--write" in argv:
-        before, rest = PAGE.read_text(encoding="utf-8").split(BEGIN)
-        PAGE.write_text(before + BEGIN + text + END + rest.split(END)[1], encoding="utf-8")
-    return int(any("WRONG" in c.verdict for c in found))
+def summary(found: list[Cell]) -> str:
+    """The count."""
+    ran = [c for c in found if c.same is not None]
+    mesh = f"as processes over Zenoh {sum(bool(c.same) for c in ran)} of {len(ran)} gave the oracle's bits"
+    verdicts = {name: sum(c.verdict == name for c in found) for name in ("right", "flagged")}
+    silent = len(found) - sum(verdicts.values())
+    return (
+        f"Seed of the faults {SEED}; plant and noise as in the topology files (seed 0). {len(found)} cells: "
+        f"{verdicts['right']} right, {verdicts['flagged']} flagged, {silent} silently wrong; "
+        f"{mesh if ran else 'from the oracle alone'}."
+    )
+
+
+def main() -> int:
+    """Run the cells, print the tables, write them if asked."""
+    p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p.add_argument("--mesh", action="store_true")
+    p.add_argument("--write", action="store_true")
+    p.add_argument("--only", default="")
+    args = p.parse_args()
+    if args.only and args.write:
+        p.error("--write needs all cases")
+    cases, begin, found = tuple(case for case in CASES if args.only in case.name), time.monotonic(), list[Cell]()
+    for cell in cells(cases, args.mesh):
+        found.append(cell)
+        print(
+            f"{time.monotonic() - begin:6.1f} s  {cell.case}; {cell.fault}: {verdict(cell)}",
+            file=sys.stderr,
+            flush=True,
+        )
+    page = Page("reliability.md", "table")
+    page.say(summary(found))
+    page.say()
+    page.say(overview(found))
+    for kind in KINDS:
+        page.say()
+        page.say(details(kind, [c for c in found if c.kind == kind]))
+    if args.write:
+        page.write()
+    return int(any(c.same is False or "WRONG" in c.verdict for c in found))
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(main())
