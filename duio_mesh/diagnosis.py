@@ -136,12 +136,18 @@ def in_words(processes: Processes, few: int = FEW) -> str:
 def culprits(processes: Processes, deadline: float, now: float) -> list[tuple[Process, list[str]]]:
     """Nodes that have kept others waiting for longer than ``deadline`` seconds, and who has waited so long.
 
-    Not one that has just taken the place of another, for which they had waited.
+    Not one that has just taken the place of another, for which they had waited. The plant waits for all nodes alike,
+    and may have begun to before those among them that only wait themselves could say so: it has to have waited for
+    twice as long, unless the node is stopped.
     """
     late = [p for p in essential(processes) if p.waits and now - p.since > deadline]
-    causes = roots(processes) if late else []
-    nodes = [p for p in causes if p.who.startswith("node-") and any(p.who in other.waits["on"] for other in late)]
-    return [(p, [other.who for other in late]) for p in nodes if p.pid and p.code is None and now - p.born > deadline]
+    found = []
+    for p in roots(processes) if late else ():
+        if p.who.startswith("node-") and p.pid and p.code is None and now - p.born > deadline:
+            blamed = [other for other in late if p.who in other.waits["on"]]
+            if any(o.waits["link"] or now - o.since > 2 * deadline for o in blamed) or (blamed and p.stopped()):
+                found.append((p, [other.who for other in late]))
+    return found
 
 
 def owing(processes: Processes) -> list[Process]:

@@ -48,8 +48,8 @@ class Links:
             self.lockstep = self.exchange = clock = Realtime(spec, mesh, self.told, self.late, gaps.add)
             self._sample: Callable[[int, int, int], Array] = clock.sample
             return
-        deadline = spec.deadline * (1 if spec.on_loss == "stop" else PATIENCE)
-        self.lockstep = lockstep = Lockstep(mesh, deadline, report)
+        times = 1 if spec.on_loss == "stop" else PATIENCE
+        self.lockstep = lockstep = Lockstep(mesh, spec.deadline, report, times)
         self._plant = Line(mesh, keys.plant(i), f"plant -> {i}", "plant", ("plant", i), window)
         self._plant.patient = spec.outside
         self._sample = partial(lockstep.take, self._plant)

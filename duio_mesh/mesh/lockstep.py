@@ -107,12 +107,14 @@ class Line(Source):
 class Lockstep:
     """Takes frames in order; a context manager around the time in which it may wait."""
 
-    def __init__(self, mesh: Mesh, deadline: float, say: Callable[..., None] = lambda *_, **__: None) -> None:
-        """``deadline``: seconds that any one wait may last.
+    def __init__(
+        self, mesh: Mesh, deadline: float, say: Callable[..., None] = lambda *_, **__: None, times: int = 1
+    ) -> None:
+        """``deadline``: seconds; any one wait may last ``times`` as long.
 
         ``say`` is called as say("waiting", on=, link=, k=, r=) when one lasts long, say("moving") when that is over.
         """
-        self._mesh, self._deadline, self._say = mesh, deadline, say
+        self._mesh, self._deadline, self._say, self._soon = mesh, deadline * times, say, soon(deadline)
         self.first = 0  # earlier steps' frames were meant for a process before this one
         self._at: tuple[Line, int, int] | None = None  # what the main thread waits for
         self._news, self._over = threading.Event(), False
@@ -242,7 +244,7 @@ class Lockstep:
             if not at:
                 continue
             line, k, r = at
-            if now - since > soon(self._deadline) and not told:
+            if now - since > self._soon and not told:
                 told = True
                 self._say("waiting", on=[line.who], link=line.name, k=k, r=r, waited=now - since)
             if now - since > self._deadline and not line.patient:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
@@ -53,8 +54,9 @@ class Running:
     def pid(self, who: str) -> int:
         """The pid of a process of this run, found by its name among the launcher's descendants."""
         for p in psutil.Process(self.process.pid).children(recursive=True):
-            if p.name() == f"duio-{who}" or f"duio-{who}" in p.cmdline():
-                return p.pid
+            with contextlib.suppress(psutil.NoSuchProcess):  # it has just ended
+                if p.name() == f"duio-{who}" or f"duio-{who}" in p.cmdline():
+                    return p.pid
         raise AssertionError(f"no process duio-{who}")
 
     def send(self, who: str, number: signal.Signals) -> None:
