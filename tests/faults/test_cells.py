@@ -71,7 +71,7 @@ def test_every_case_has_room_and_its_faults_are_accepted(bench: ModuleType) -> N
 @pytest.mark.mesh
 @pytest.mark.usefixtures("nothing_left")
 def test_cells_as_processes(bench: ModuleType) -> None:
-    case = bench.Case("admm relaxed, ring", "relaxed_ring", 60, (20, 30))
+    case = bench.Case("lmi, star", "star", 160, (100, 120))
     names = ("loss 20 %", "kill, restart", "pause, resume")
     found = {cell.fault: cell for cell in bench.cells((case,), True, names)}
     assert tuple(found) == names
