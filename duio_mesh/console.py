@@ -6,7 +6,8 @@ import contextlib
 import math
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from typing import Any
 
 from rich.console import Console
@@ -16,11 +17,12 @@ from rich.table import Table
 
 from duio_mesh import launcher
 from duio_mesh.launcher import RunResult
+from duio_mesh.report.losses import Rest, badness, rest
 from duio_mesh.report.recovery import loss_in_words
 from duio_mesh.report.timeliness import in_words
+from duio_mesh.synthesis.contingency import radius_of
 from duio_mesh.synthesis.design import Design
 
-SLOW = 0.1  # of an error left by a step that starts afresh: the estimate is not worth its name
 MANY = 16  # nodes or warnings, from which on only some are shown
 QUIET = 5.0  # seconds without a word about a design in a log
 FEW = 8  # nodes whose errors are shown one by one
@@ -158,27 +160,35 @@ def certificate(design: Design) -> None:
     _out.print(conditions)
     _out.print(_by_node(found["nodes"]))
     for name, value in found.items():
-        if name not in ("conditions", "nodes", "contingency"):
+        if name not in ("conditions", "nodes", "contingency", "node_loss"):
             _out.print(f"{name:24} {_text(value)}")
+    if cases := found.get("node_loss"):
+        title = f"when a node is lost ({design.scenario.run.on_node_loss}): spectral radius of {radius_of(design)}"
+        shown = chosen({case["lost"]: case for case in cases.values()}, "radius")
+        _losses(title, cases.values(), ({**case, "lost": name} for name, case in shown))
     if "contingency" in found:
-        _contingency(found["contingency"])
+        said = found["contingency"]
+        nothing = {"lost": "nothing", "radius": said["nominal"], "failing": said["nominal_failing"]}
+        _losses(f"contingencies: spectral radius of {said['radius_of']}", said["cases"], (nothing, *said["cases"]))
 
 
-def _contingency(found: Mapping[str, Any]) -> None:
-    """What is left after each loss, and the worst."""
-    table = Table("lost", "radius", "the rest", title=f"contingencies: spectral radius of {found['radius_of']}")
-    for case in ({"lost": "nothing", "radius": found["nominal"], "failing": found["nominal_failing"]}, *found["cases"]):
+def _losses(title: str, cases: Collection[Mapping[str, Any]], shown: Iterable[Mapping[str, Any]]) -> None:
+    """What is left after each loss, and the worst of ``cases``."""
+    table = Table("lost", "radius", "the rest", title=title)
+    for case in shown:
         words = "[green]reconstructs[/]"
-        if case["failing"]:
+        if (left := rest(case)) is Rest.BAD:
             islands = " and ".join(_text(ids) for ids in case["failing"])
             words = f"[red]does not:[/] nodes {escape(islands)}"
-        elif case.get("left", 0) > SLOW:
+        elif left is Rest.SLOW:
             words = f"[yellow]too slowly:[/] a step leaves {case['left']:.0%} of the error"
         table.add_row(case["lost"], _text(case["radius"]), words)
     _out.print(table)
-    lost = sum(bool(case["failing"]) for case in found["cases"])
-    _out.print(f"{'worst':24} {found['worst'] or '-'}")
-    _out.print(f"{'survives':24} {len(found['cases']) - lost} of {len(found['cases'])}")
+    worst = max(cases, key=badness, default=None)
+    counts = Counter(map(rest, cases))
+    slowly = f", {counts[Rest.SLOW]} of them too slowly" if counts[Rest.SLOW] else ""
+    _out.print(f"{'worst':24} {worst['lost'] if worst else '-'}")
+    _out.print(f"{'survives':24} {len(cases) - counts[Rest.BAD]} of {len(cases)}{slowly}")
 
 
 def _by_node(nodes: Mapping[Any, Mapping[str, Any]]) -> Table:

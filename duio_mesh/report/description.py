@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from duio_mesh.report.losses import node_loss_in_words
 from duio_mesh.scenario.model import Scenario
 
 WIDE = 7  # columns of a table that fit a page; further ones go into a second table
@@ -34,11 +35,14 @@ def describe(scenario: Scenario, certificate: Mapping[str, Any]) -> str:
         ),
     ]
     certificate = dict(certificate)
+    lost = certificate.pop("node_loss", {})
     conditions, nodes = certificate.pop("conditions", {}), certificate.pop("nodes", {})
     if conditions:
         lines += ["", "## Conditions", *_conditions(conditions)]
     if certificate:
         lines += ["", "## Design", *_table(["figure", "value"], [[name, v] for name, v in certificate.items()])]
+    if lost:
+        lines += ["", node_loss_in_words(lost, run.on_node_loss)]
     if nodes:
         lines += ["", "## Design, by node", *_nodes(nodes)]
     return "\n".join(lines) + "\n"

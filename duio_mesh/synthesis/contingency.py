@@ -11,6 +11,7 @@ from __future__ import annotations
 import importlib
 from dataclasses import replace
 from functools import cache
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -62,11 +63,9 @@ class Cases:
 
     def __init__(self, design: Design, progress: Progress = lambda _: None) -> None:
         """Raises DesignError when the method has no error matrix to offer."""
-        method = importlib.import_module(f"duio_mesh.synthesis.{design.scenario.method}")
-        if not hasattr(method, "error_radius"):
-            raise DesignError(f"contingency: {design.scenario.method} says nothing about its errors on another graph")
+        method = _method(design)
         self._graph, self._progress = design.scenario.graph, progress
-        self.radius_of: str = method.RADIUS_OF
+        self.radius_of = radius_of(design)
         self._radius = cache(lambda island: float(method.error_radius(design, island)))
         self._left = cache(lambda island: float(method.error_left(design, island)))
         self._afresh = hasattr(method, "error_left")
@@ -86,6 +85,18 @@ class Cases:
             "reconstructs": not failing,
             "failing": failing,
         } | ({"left": _plain(max(map(self._left, islands.values())))} if self._afresh else {})
+
+
+def radius_of(design: Design) -> str:
+    """Of what the radii of this design's cases are. Raises DesignError as ``Cases`` does."""
+    return str(_method(design).RADIUS_OF)
+
+
+def _method(design: Design) -> ModuleType:
+    method = importlib.import_module(f"duio_mesh.synthesis.{design.scenario.method}")
+    if not hasattr(method, "error_radius"):
+        raise DesignError(f"contingency: {design.scenario.method} says nothing about its errors on another graph")
+    return method
 
 
 def _plain(value: float) -> float | None:
