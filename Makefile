@@ -44,9 +44,11 @@ soak: $(VENV)/ready ## a million rounds: nothing grows, nothing is lost, the ora
 scaling: $(VENV)/ready ## the model of rounds per second, fitted and tested (as root: network namespaces); into docs/scaling.md
 	$(PY) bench/network.py --write
 
-reliability: $(VENV)/tests ## what every observer makes of every fault; tables and figure of docs/reliability.md
-	OPENBLAS_NUM_THREADS=1 $(PY) bench/reliability.py --write
+LOSSES ?= --kills 100 --freezes 20
+reliability: $(VENV)/tests ## every observer under every fault, in the mesh and out of it; tables and figure of docs/reliability.md
 	OPENBLAS_NUM_THREADS=1 $(PY) bench/admm_loss.py --write
+	OPENBLAS_NUM_THREADS=1 $(PY) bench/reliability.py --mesh --write
+	$(PY) bench/losses.py $(LOSSES) --write
 
 clean: ## remove the virtual environment and caches, keep runs/
 	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .hypothesis

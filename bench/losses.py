@@ -1,6 +1,8 @@
 """Random kills and freezes of random nodes in runs with `on_node_loss: restart`: do they finish, and right?
 
     python bench/losses.py --kills 100 --freezes 20 --seed 1
+    python bench/losses.py --kills 10 --freezes 2    a first look
+    python bench/losses.py --write                   and put the result into docs/reliability.md
 
 Every run is started from the command line, as a user would. A node is chosen, and a moment: as soon as its process
 exists, or when it has written a random part of its rows. Then it gets SIGKILL, or SIGSTOP and 2 s later SIGCONT. Asked
@@ -25,6 +27,7 @@ from pathlib import Path
 from typing import Any
 
 import psutil
+from page import Page
 
 ROOT = Path(__file__).parent.parent
 RUNS = {  # topology -> what to change, so that a run lasts a second or two; floats in a row, the flag included
@@ -124,18 +127,24 @@ def main() -> int:
     p.add_argument("--kills", type=int, default=100)
     p.add_argument("--freezes", type=int, default=20)
     p.add_argument("--seed", type=int, default=1)
+    p.add_argument("--write", action="store_true")
     args = p.parse_args()
     os.environ["OPENBLAS_NUM_THREADS"] = "1"
     good: Counter[str] = Counter()
-    bad = []
+    bad = list[Case]()
     with tempfile.TemporaryDirectory() as folder:
         for number, case in enumerate(cases(args.kills, args.freezes, args.seed)):
             problem = case.run(Path(folder) / str(number))
             good["freeze" if case.freeze else "kill"] += not problem
             print(f"{number + 1:4} {case}: {problem or 'ok'}", flush=True)
-            bad += [f"{case}: {problem}"] if problem else []
+            bad += [case] if problem else []
     kills, freezes = f"{good['kill']} of {args.kills} kills", f"{good['freeze']} of {args.freezes} freezes"
-    print(f"seed {args.seed}: {kills} and {freezes} survived")
+    page = Page("reliability.md", "losses")
+    page.say(f"Seed {args.seed}: {kills} and {freezes} survived.")
+    if bad:
+        page.say("\n".join(["Not:", "", *(f"- {case}" for case in bad)]))
+    if args.write:
+        page.write()
     return 1 if bad else 0
 
 
