@@ -59,6 +59,13 @@ class Running:
                     return p.pid
         raise AssertionError(f"no process duio-{who}")
 
+    def exists(self, who: str) -> bool:
+        """Whether there is such a process."""
+        try:
+            return bool(self.pid(who))
+        except AssertionError:
+            return False
+
     def send(self, who: str, number: signal.Signals) -> None:
         """A signal to one process of the run, or to the launcher."""
         os.kill(self.process.pid if who == "launcher" else self.pid(who), number)

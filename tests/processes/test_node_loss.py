@@ -41,13 +41,6 @@ def about(run: Running, who: str, event: str, node: int) -> list[dict[str, Any]]
     return [e for e in happened(run, who, event) if e["node"] == node]
 
 
-def exists(run: Running, who: str) -> bool:
-    try:
-        return bool(run.pid(who))
-    except AssertionError:
-        return False
-
-
 @contextmanager
 def halted(*options: str, at: int = HALT) -> Iterator[Running]:
     """A run whose node 1 has stopped at the beginning of a step; nobody has anything left to do when node 3 says so.
@@ -111,7 +104,7 @@ def test_stop() -> None:
 def test_degrade_gives_the_bits_of_a_planned_kill() -> None:
     with halted(*asked("degrade", LONG_WAIT)) as run:
         run.send("node-3", signal.SIGKILL)
-        wait_for(lambda: not exists(run, "node-3"))
+        wait_for(lambda: not run.exists("node-3"))
         run.send("node-1", signal.SIGCONT)
         assert run.end() == 0, run.stderr
         assert "warning: node-3: node-3 was killed by SIGKILL; the others went on without it" in run.stdout
