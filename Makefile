@@ -13,7 +13,7 @@ run: $(VENV)/ready ## install if need be, then run the nine-room building on two
 	$(PY) launch.py $(TOPOLOGY)
 
 test: $(VENV)/tests ## install if need be, then run all tests
-	$(PY) -m pytest
+	$(PY) -m pytest -n 2 --dist loadfile
 
 check: lint types test ## everything that CI checks
 
