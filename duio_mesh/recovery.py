@@ -24,6 +24,8 @@ class Recovery:
         if not lost.who.startswith("node-"):
             return False
         supervisor, who = self._supervisor, lost.who
+        if self._policy == "degrade" and not all(p.said for p in supervisor.processes.values() if p.essential):
+            return False  # a run begins with everybody: the others would look for it until the start's time is over
         supervisor.remember("death", who=who, text=lost.death())
         if self._policy == "degrade" or supervisor.source_done():
             lost.there = False

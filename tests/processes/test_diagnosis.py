@@ -125,6 +125,35 @@ def test_only_a_node_that_kept_others_waiting_too_long_is_a_culprit() -> None:
     assert culprits(plant, 4.9, NOW) == [], "nobody replaces a plant"
 
 
+def test_a_node_for_which_only_the_plant_waits_has_time_to_say_that_it_waits_itself(stopped: int) -> None:
+    """The plant waits for all alike; a neighbour's wait is for this very node. Who is stopped will not say anything."""
+    plants = waiting({"plant": ["node-1", "node-2"]}, "node-1", "node-2")
+    assert culprits(plants, 2.6, NOW) == []
+    assert [p.who for p, _ in culprits(plants, 2.4, NOW)] == ["node-1", "node-2"]
+    plants["node-2"].pid = stopped
+    assert [p.who for p, _ in culprits(plants, 2.6, NOW)] == ["node-2"]
+    plants["node-1"].hear(
+        {"event": "waiting", "on": ["node-2"], "link": "edge 2 -> 1", "k": 7, "r": 1, "waited": 0.6}, NOW
+    )
+    assert [p.who for p, _ in culprits(plants, 2.4, NOW)] == ["node-2"]
+
+
+def test_a_process_that_has_just_taken_a_place_is_not_blamed_for_the_one_before() -> None:
+    ring = waiting({"node-1": ["node-2"], "node-3": ["node-2"]})
+    ring["node-2"] = Process("node-2")
+    assert culprits(ring, 1.0, NOW) == []  # ordered, but not yet started
+    ring["node-2"].hear({"event": "started", "pid": os.getpid()}, NOW - 0.9)
+    assert culprits(ring, 1.0, NOW) == []
+    assert [p.who for p, _ in culprits(ring, 1.0, NOW + 0.2)] == ["node-2"]
+
+
+def test_who_is_stopped_is_said_even_when_nobody_waits_for_it(stopped: int) -> None:
+    run = {who: Process(who) for who in ("plant", "node-1")}
+    run["plant"].hear({"event": "started", "pid": stopped}, NOW)
+    assert in_words(run) == ""
+    assert first_cause(run) == "plant is stopped"
+
+
 def test_the_first_cause_is_the_killed_then_the_failed_then_those_who_lost_them() -> None:
     run = {who: Process(who) for who in ("plant", "node-1", "node-2", "node-3", "recorder")}
     assert first_cause(run) == ""

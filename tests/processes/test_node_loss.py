@@ -133,6 +133,19 @@ def test_restart_gives_the_bits_of_a_planned_restart() -> None:
         equal(run, oracle({"node": 3, "restart": lost, "away": k - lost}, policy="restart"), k)
 
 
+@pytest.mark.parametrize(("policy", "code"), [("degrade", 3), ("restart", 0)])
+def test_a_node_that_dies_at_the_start(policy: str, code: int) -> None:
+    """A run begins with everybody: with another process, or not at all, which is said at once."""
+    with Running("ring.yaml", *asked(policy, LONG_WAIT), steps=STEPS) as run:
+        wait_for(lambda: run.exists("node-2"))
+        run.send("node-2", signal.SIGKILL)
+        assert run.end() == code, run.stderr
+        if code:
+            assert "run failed: node-2 was killed by SIGKILL" in run.stderr
+        else:
+            assert [e["who"] for e in events(run, "back")] == ["node-2"]
+
+
 def test_neighbours_notice_within_milliseconds_and_one_node_after_the_other_comes_back() -> None:
     """In full run: everybody is killed once, and each time only its neighbours say so, at once."""
     with Running("ring.yaml", *asked("restart", "run.deadline=30.0")) as run:
