@@ -210,18 +210,27 @@ class Supervisor:
             raise RunError("the nursery process, which starts and watches the others, has died") from None
 
     def _listen(self, timeout: float) -> None:
-        """Take in what has been said within ``timeout`` seconds, returning at the first news."""
+        """Take in what has been said within ``timeout`` seconds, returning at the first news.
+
+        Who is said to have ended has said its last words before that: they are heard as well.
+        """
         ready, _, _ = select.select(list(self._text), [], [], timeout)
         for fd in ready:
-            data = os.read(fd, 1 << 16)
-            if not data and fd == self._control.fileno():
-                raise RunError("the nursery process, which starts and watches the others, has died")
-            if not data:
-                del self._text[fd]
-                continue
-            *lines, self._text[fd] = (self._text[fd] + data).split(b"\n")
-            for line in lines:
-                self._hear(json.loads(line))
+            self._read(fd)
+        if self._control.fileno() in ready:
+            while self._status in self._text and select.select([self._status], [], [], 0)[0]:
+                self._read(self._status)
+
+    def _read(self, fd: int) -> None:
+        data = os.read(fd, 1 << 16)
+        if not data and fd == self._control.fileno():
+            raise RunError("the nursery process, which starts and watches the others, has died")
+        if not data:
+            del self._text[fd]
+            return
+        *lines, self._text[fd] = (self._text[fd] + data).split(b"\n")
+        for line in lines:
+            self._hear(json.loads(line))
 
     def _hear(self, event: dict[str, Any]) -> None:
         self._beats += 1

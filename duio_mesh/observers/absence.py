@@ -287,7 +287,9 @@ class Fused(_Guard):
         self._inner.exchange(r, given)
 
     def _doubted(self, heard: Mapping[int, Array], told: float) -> float:
-        unsettled = UNSETTLED * (told > 0 or self._doubt > 0)
+        unsettled = UNSETTLED * (
+            told % 1 > 0 or self._doubt % 1 > 0
+        )  # as fast as the fusion carries what it comes from
         if self._exact:
             missed = any(j not in heard and j not in self._excused for j in self._hears)
             return 1.0 if missed or told >= 1 or self._doubt >= 1 else unsettled
