@@ -4,7 +4,7 @@ VENV := .venv
 PY := $(VENV)/bin/python
 TOPOLOGY ?= topologies/partitioned.yaml
 
-.PHONY: help run test check lint types schema bench scale soak scaling reliability clean
+.PHONY: help run test check lint types schema bench scale soak scaling reliability losses clean
 
 help: ## this list
 	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 10
@@ -44,11 +44,13 @@ soak: $(VENV)/ready ## a million rounds: nothing grows, nothing is lost, the ora
 scaling: $(VENV)/ready ## the model of rounds per second, fitted and tested (as root: network namespaces); into docs/scaling.md
 	$(PY) bench/network.py --write
 
-LOSSES ?= --kills 100 --freezes 20
 reliability: $(VENV)/tests ## every observer under every fault, in the mesh and out of it; tables and figure of docs/reliability.md
 	OPENBLAS_NUM_THREADS=1 $(PY) bench/admm_loss.py --write
 	OPENBLAS_NUM_THREADS=1 $(PY) bench/reliability.py --mesh --write
-	$(PY) bench/losses.py $(LOSSES) --write
+	$(PY) bench/losses.py --kills 10 --freezes 2
+
+losses: $(VENV)/tests ## 100 kills and 20 freezes of random nodes at random moments; into docs/reliability.md
+	$(PY) bench/losses.py --write
 
 clean: ## remove the virtual environment and caches, keep runs/
 	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -2,6 +2,7 @@
 
     python bench/reliability.py            print the table, from the oracle: two minutes of CPU time
     python bench/reliability.py --mesh     and run every cell as processes over Zenoh, too: it has to give the same bits
+                                           (several minutes)
     python bench/reliability.py --write    put the table into docs/reliability.md
     python bench/reliability.py --only relaxed    only cases whose name has this in it
 
