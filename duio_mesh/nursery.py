@@ -76,7 +76,10 @@ class Nursery:
                     os.read(wake_read, 4096)
                 self._bury()
             if self._control in ready:
-                data = self._control.recv(65536)
+                try:
+                    data = self._control.recv(65536)
+                except ConnectionResetError:  # it was killed before it had read what we told it
+                    data = b""
                 if not data:
                     break
                 *lines, text = (text + data).split(b"\n")
