@@ -186,7 +186,7 @@ def test_a_port_that_somebody_took_is_not_the_end(tmp_path: Path, monkeypatch: p
 
 
 FULL = """
-import resource, sys
+import os, resource, sys
 from pathlib import Path
 from synthetic import make_rows, make_spec
 from duio_mesh.report.recording import Recording
@@ -199,7 +199,8 @@ try:
     recording.fill(truth, rows)
     getattr(recording, sys.argv[2])()
 except OSError as e:
-    print(e)
+    print(e, flush=True)
+os._exit(0)  # as a recorder ends
 """
 
 
