@@ -30,7 +30,7 @@ import psutil
 from page import Page
 
 ROOT = Path(__file__).parent.parent
-# ADMM's local estimates forget a start from their neighbours' marked ones with 0.988 a step: errors are 1e-3 for a while
+# ADMM forgets a start from its neighbours' marked estimates with 0.988 a step: errors are 1e-3 for a while
 RUNS = {  # topology -> what to change, so that a run lasts a second or two; floats in a row, the flag included
     "ring.yaml": (10, {"run.steps": 6000}),
     "six_state_ring.yaml": (7, {"run.steps": 4000, "run.convergence.rms_below": 10}),

@@ -24,7 +24,7 @@ from duio_mesh.mesh.rejoin import ASK, admit
 from duio_mesh.process import Report, main
 from duio_mesh.spec import PATIENCE, PlantSpec, blocks
 
-RECORDER = 6.0  # seconds to wait for a recorder, so that short runs can be seen from their beginning
+RECORDER = 4.0  # seconds to wait for a recorder, so that short runs can be seen from their beginning
 
 
 class Credits:

@@ -119,7 +119,7 @@ class FileStream:
     def close(self) -> None:
         """Write what is left, and the footer. Raises OSError when that is impossible (a full disk)."""
         self.flush()
-        self._stream.disconnect()  # not after a failure: it would try to write once more, and has been seen to hang then
+        self._stream.disconnect()  # not after a failure: it would write once more, and has been seen to hang then
 
 
 class LiveStream:

@@ -132,7 +132,7 @@ def test_a_frozen_viewer_holds_nobody_up(tmp_path: Path, monkeypatch: pytest.Mon
             if len(received) < 4096:  # then it freezes
                 received += viewer.recv(4096)
         assert b"duio_mesh synthetic_ring" in received
-        assert recording.dropped > 100
+        assert recording.dropped > 0
         recording.close()
     recording._live._thread.join(30)  # the viewer is gone: what was left behind ends
     assert not recording._live._thread.is_alive()
