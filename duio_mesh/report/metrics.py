@@ -62,7 +62,7 @@ def metrics(trace: Trace, scenario: Scenario, counts: Mapping[str, Any]) -> dict
         said = verdict(judging, wanted.rms_below, complete=complete)
         for i, found in figures.items():
             nodes[str(i)] |= {name: _finite(value) for name, value in found.items()}
-    if trace.flagged is not None:
+    if trace.flagged is not None and not counts.get("failure"):  # else the nodes' rows end where the end caught them
         said |= {"remarks": remarks(trace)}
         if not scenario.outside:  # nobody knows an error
             said |= {"recovery": recovery(trace)}
