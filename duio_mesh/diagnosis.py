@@ -26,7 +26,7 @@ class Process:
         self.code: int | None = None  # exit code; negative is a signal
         self.warnings: list[str] = []
         self.pid = 0
-        self.born = 0.0  # on the clock of ``hear``
+        self.heard = 0.0  # when it, or the nursery about it, last said anything
         self.waits: dict[str, Any] = {}  # what it says that it waits for, when that takes long ...
         self.since = 0.0  # ... since when
         self.wakes: float | None = None  # it is stopped on purpose until then
@@ -36,7 +36,7 @@ class Process:
 
     def hear(self, event: Mapping[str, Any], now: float) -> None:
         """Take in what it, or the nursery about it, has said. ``now``: seconds of a steady clock."""
-        what = event["event"]
+        what, self.heard = event["event"], now
         if what == "ready":
             self.said = dict(event)
         elif what == "done":
@@ -46,7 +46,7 @@ class Process:
         elif what == "warning":
             self.warnings.append(event["text"])
         elif what == "started":
-            self.pid, self.born = event["pid"], now
+            self.pid = event["pid"]
         elif what == "waiting":
             self.waits, self.since = dict(event), now - event["waited"]
         elif what == "moving":
@@ -136,14 +136,15 @@ def in_words(processes: Processes, few: int = FEW) -> str:
 def culprits(processes: Processes, deadline: float, now: float) -> list[tuple[Process, list[str]]]:
     """Nodes that have kept others waiting for longer than ``deadline`` seconds, and who has waited so long.
 
-    Not one that has just taken the place of another, for which they had waited. The plant waits for all nodes alike,
-    and may have begun to before those among them that only wait themselves could say so: it has to have waited for
-    twice as long, unless the node is stopped.
+    Not one that has said anything in that time: it has only just been freed itself, has taken the place of another, or
+    is busy. The plant waits for all nodes alike, and may have begun to before those among them that only wait
+    themselves could say so: it has to have waited for twice as long, unless the node is stopped.
     """
     late = [p for p in essential(processes) if p.waits and now - p.since > deadline]
     found = []
     for p in roots(processes) if late else ():
-        if p.who.startswith("node-") and p.pid and p.code is None and now - p.born > deadline:
+        silent = p.stopped() or now - p.heard > deadline
+        if p.who.startswith("node-") and p.pid and p.code is None and silent:
             blamed = [other for other in late if p.who in other.waits["on"]]
             if any(o.waits["link"] or now - o.since > 2 * deadline for o in blamed) or (blamed and p.stopped()):
                 found.append((p, [other.who for other in late]))

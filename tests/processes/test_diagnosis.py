@@ -147,6 +147,15 @@ def test_a_process_that_has_just_taken_a_place_is_not_blamed_for_the_one_before(
     assert [p.who for p, _ in culprits(ring, 1.0, NOW + 0.2)] == ["node-2"]
 
 
+def test_a_node_that_has_just_been_freed_is_not_blamed_by_those_who_have_not_heard_of_it_yet() -> None:
+    """3 was frozen, 2 waited for it and 1 for 2; 3 is dead now, 2 has said that it goes on, 1 has not yet."""
+    chain = waiting({"node-1": ["node-2"], "node-2": ["node-3"]}, "node-3")
+    chain["node-3"].hear({"event": "exit", "code": -9}, NOW)
+    chain["node-2"].hear({"event": "moving"}, NOW)
+    assert culprits(chain, 1.0, NOW + 0.1) == []
+    assert [p.who for p, _ in culprits(chain, 1.0, NOW + 1.1)] == ["node-2"]
+
+
 def test_who_is_stopped_is_said_even_when_nobody_waits_for_it(stopped: int) -> None:
     run = {who: Process(who) for who in ("plant", "node-1")}
     run["plant"].hear({"event": "started", "pid": stopped}, NOW)
