@@ -43,19 +43,21 @@ class Credits:
         while self._mesh.pending():
             self._take(0.0)
 
-    def wait(self, steps: int) -> None:
+    def wait(self, steps: int, before: int | None = None) -> None:
         """Wait until every node that is there has finished ``steps`` steps.
 
+        ``before``: the step that is to be sent next. Then a node that is being replaced is waited for as well, until it
+        asks to come back: the others are never more than a window ahead of where it was lost.
         Raises RunError naming the nodes that do not move before the deadline, or that are lost.
         """
-        self._until(lambda: self._late(steps), steps)
+        self._until(lambda: self._late(steps) + self._replaced(steps, before), steps)
 
     def admit(self, k: int) -> dict[int, int]:
         """Who comes back at step k -> processes of it before; those that are meant to are waited for."""
         absent = self._spec.absent
         expected = [i for i, spans in absent.items() if any(after == k for _, after in spans)]
         self._until(lambda: [i for i in expected if i not in self._asking], k)
-        early = {i for i in self._asking if any(first <= k < after for first, after in absent.get(i, ()))}
+        early = {i for i in self._asking if self._planned(i, k)}
         back = {i: before for i, before in self._asking.items() if i not in early}
         self._asking = {i: before for i, before in self._asking.items() if i in early}
         self._done |= dict.fromkeys(back, k)
@@ -70,6 +72,17 @@ class Credits:
         if self._spec.on_loss != "restart":
             raise RunError(f"the plant has lost every node before step {steps}")
         return [] if self._asking else list(self._done)
+
+    def _replaced(self, steps: int, before: int | None) -> list[int]:
+        """Nodes that are lost, not on purpose at this time, and whose next process has not asked yet."""
+        if before is None or self._spec.on_loss != "restart":
+            return []
+        unplanned = [i for i in sorted(self.away) if i not in self._asking and not self._planned(i, before)]
+        return [i for i in unplanned if self._done[i] < steps]
+
+    def _planned(self, i: int, k: int) -> bool:
+        """Whether node i is not meant to be there in step k."""
+        return any(first <= k < after for first, after in self._spec.absent.get(i, ()))
 
     def _until(self, missing: Callable[[], list[int]], steps: int) -> None:
         heard, said = time.monotonic(), False
@@ -147,7 +160,7 @@ def run(spec: PlantSpec, report: Report) -> None:
         with Journal(spec.output, plant.x.size, truth) as journal:
             for block in blocks(0, spec.steps, spec.block, returns):
                 credits.collect()
-                credits.wait(block.stop - spec.window)
+                credits.wait(block.stop - spec.window, block.start)
                 if back := credits.admit(block.start):
                     admit(samples, block.start, back, credits.away, {i: data[-1] for i, data in rows.items()})
                 pace.until(block.start)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -13,9 +14,10 @@ from duio_mesh.synthesis.contingency import Cases
 from duio_mesh.synthesis.design import Design, Progress, flow_control
 from duio_mesh.synthesis.losses import Loss
 
-SETTLED = 1e-3
-LEFT = 1e-3
-"""Of the error that a step which starts afresh may leave after a loss, or twice what it leaves anyway."""
+SETTLED = 1e-3  # of an error: what is left of it when a process that began from nothing is trusted
+GROWTH = 10.0  # of errors while a node is away, in a window
+CONTRACTS_NOT = 1e-6  # above 1: a radius that rounding alone does not explain
+LEFT = 1e-3  # of an error: what a step that starts afresh may leave after a loss, or twice what it leaves anyway
 
 
 def with_recovery(design: Design, progress: Progress = lambda _: None) -> Design:
@@ -40,14 +42,21 @@ def with_recovery(design: Design, progress: Progress = lambda _: None) -> Design
         for i, spec in design.nodes.items()
     }
     certificate = {**design.certificate, "node_loss": found}
-    return _in_reach(replace(design, nodes=nodes, certificate=certificate))
+    design = replace(design, nodes=nodes, certificate=certificate)
+    return _in_reach(design, found) if scenario.run.on_node_loss == "restart" else design
 
 
-def _in_reach(design: Design) -> Design:
-    """The design with a window in rounds rather than steps: a node comes back where the plant is by then."""
+def _in_reach(design: Design, losses: Mapping[int, dict[str, Any]]) -> Design:
+    """The design with a smaller window, since the others are up to a window ahead when a lost node comes back.
+
+    In rounds rather than steps; and where errors grow without a node, at most GROWTH times in so many steps.
+    """
     run, spec = design.scenario.run, next(iter(design.nodes.values()))
-    rounds = make_observer(spec).rounds
-    flow = flow_control(run, run.window // rounds)
+    window = run.window // make_observer(spec).rounds
+    worst = max((case["radius"] or 0.0 for case in losses.values()), default=0.0)
+    if worst > 1 + CONTRACTS_NOT:
+        window = min(window, int(np.log(GROWTH) / np.log(worst)))
+    flow = flow_control(run, window)
     block = 1 if design.scenario.outside else flow.quarter
     return replace(
         design,
