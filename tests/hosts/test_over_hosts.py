@@ -86,7 +86,7 @@ def test_a_run_over_three_hosts_equals_the_oracle_bit_for_bit(transport: str, la
             south.process.send_signal(signal.SIGCONT)
             assert south.healthy()
         else:
-            assert hosts.containers["router-north"].healthy()
+            wait_for(hosts.containers["router-north"].healthy)
             assert not hosts.reaches("north", "10.80.0.3")
         hosts.up(SITE / "compose")
         assert hosts.ended() == dict.fromkeys(hosts.containers, 0), hosts.said()
