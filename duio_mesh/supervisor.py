@@ -24,7 +24,8 @@ from duio_mesh.diagnosis import Process
 from duio_mesh.errors import RunError
 from duio_mesh.spec import PATIENCE, START
 
-FRAME = 0.1  # seconds between looks at the progress
+FRAME = 0.1  # seconds between looks at the progress ...
+SHARE, SELDOM = 0.02, 1.0  # ... or more, so that they take only this part of the time; but at least so often
 MARGIN = 2.0  # seconds beyond the deadline that a process has for saying itself what it waited for
 GATHER = 0.3  # seconds after the first failure in which others may say what they saw
 END = 2.0  # seconds for asked processes to end before they are made to
@@ -44,7 +45,8 @@ class Supervisor:
         self.events: list[dict[str, Any]] = []  # what has happened to nodes on the way
         self.note = ""  # what a gateway waits for
         self._begin = time.monotonic()
-        self._beats = 0  # whatever anybody says shows that things move
+        self._beats = 0  # whatever anybody says shows that things move ...
+        self._news = False  # ... and most of it may be worth doing something about at once
         self._status, write = os.pipe()
         self._control, theirs = socket.socketpair()
         environment = os.environ | dict.fromkeys(THREADS, "1")
@@ -102,15 +104,17 @@ class Supervisor:
     ) -> None:
         """Until plant and nodes are done, or one of them is not well and ``recover`` does not know what to do about it.
 
-        ``look`` is called ten times a second, shows the progress and returns a number that grows with it.
+        ``look`` shows the progress and returns a number that grows with it; it is called ten times a second, less often
+        where it takes long because there is much to look at.
         ``recover(process)`` is called with one that has ended without being done; whether the run goes on. ``limit``:
         seconds for everything.
         Raises RunError naming the process, or the edge, step and round that a process reported.
         """
-        begin = since = time.monotonic()
-        seen = (-1, 0)
+        begin = since = next_look = time.monotonic()
+        seen, grown = (-1, 0), -1
         while not all(p.code == 0 for p in self._essential()):
-            self._listen(FRAME)
+            self._until(lambda: self._news, FRAME)
+            self._news = False
             self._wake()
             for p in self._essential():
                 if p.code and recover and recover(p):
@@ -124,7 +128,10 @@ class Supervisor:
             now = time.monotonic()
             if limit is not None and now - begin > limit:
                 raise RunError(f"the run took longer than run.max_seconds = {limit:g} s{self._who_waits()}")
-            if (news := (look(), self._beats)) != seen:
+            if now >= next_look:
+                grown = look()
+                next_look = now + min(SELDOM, max(FRAME, (time.monotonic() - now) / SHARE))
+            if (news := (grown, self._beats)) != seen:
                 seen, since = news, now
             if recover:
                 self._end_the_stuck(deadline)
@@ -234,6 +241,7 @@ class Supervisor:
 
     def _hear(self, event: dict[str, Any]) -> None:
         self._beats += 1
+        self._news = self._news or event["event"] != "beat"
         self.processes[event["who"]].hear(event, time.monotonic())
         if (what := event["event"]) == "sensors":
             self.note = event["text"]

@@ -24,25 +24,33 @@ def sum_rows(terms: Array, out: Array) -> None:
 
 
 class ColumnProduct:
-    """out = M x for a bound block x (columns of M, W): M's columns times x's rows, summed in order."""
+    """out = M x + added[0] + added[1] + ... for a bound block x (columns of M, W).
 
-    def __init__(self, M: Array, x: Array, out: Array) -> None:
-        """``x`` and ``out`` are flat buffers of M.shape[1] * W and M.shape[0] * W numbers, used in place."""
+    M's columns times x's rows, summed in order, then what is added.
+    """
+
+    def __init__(self, M: Array, x: Array, out: Array, more: int = 0) -> None:
+        """``x`` and ``out`` are flat buffers of M.shape[1] * W and M.shape[0] * W numbers, used in place.
+
+        ``out`` may be ``x``. ``more``: how many buffers of the size of ``out`` are added, ``added`` (more, out.size).
+        """
         rows, columns = M.shape
         width = out.size // rows
         single = width == 1
         self._columns = contiguous(M.T) if single else contiguous(M.T)[:, :, None]
         self._x = x.reshape((columns, 1) if single else (columns, 1, width))
-        self._terms = np.zeros((columns, rows) if single else (columns, rows, width))
+        self._terms = np.zeros((columns + more, rows) if single else (columns + more, rows, width))
+        self._products = self._terms[:columns]
+        self.added: Array = self._terms[columns:].reshape(more, out.size)
         self._out = out if single else out.reshape(rows, width)
-        self._empty = columns == 0
+        self._empty = columns + more == 0
 
     def __call__(self) -> None:
         """Compute it from what x holds now."""
         if self._empty:
             self._out.fill(0.0)
             return
-        np.multiply(self._columns, self._x, self._terms)
+        np.multiply(self._columns, self._x, self._products)
         sum_rows(self._terms, self._out)
 
 

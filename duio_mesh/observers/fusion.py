@@ -56,35 +56,31 @@ class LinearisedAdmm:
         weighted = T.T if inverse is None else inverse @ T.T  # H^-1 T' or T'
         self._near = Neighbourhood(hears, n * width)
         self.state = self._near.own
-        self._xi, self._ab = np.zeros(len(T) * width), np.zeros(n * width)
-        self._y, self._s, self._p = np.zeros(n * width), np.zeros(n * width), np.zeros(n * width)
+        self._xi = np.zeros(len(T) * width)
         self._pull = self._near.weights(
-            alpha * gamma / 2 * degree, {j: -alpha * gamma / 2 * a for j, a in hears.items()}
+            -alpha * gamma / 2 * degree, {j: alpha * gamma / 2 * a for j, a in hears.items()}
         )
-        self._load = ColumnProduct(alpha * weighted, self._xi, self._ab)
-        self._advance = ColumnProduct(np.eye(n) - alpha * weighted @ T, self.state, self._y)
+        self._load = ColumnProduct(alpha * weighted, self._xi, self.state)
+        self._advance = ColumnProduct(np.eye(n) - alpha * weighted @ T, self.state, self.state, more=2)
+        self._s, self._p = self._advance.added
 
     def begin(self, xi: Array) -> None:
-        """x[1] = alpha b. Inside, s = alpha phi and p = alpha (psi - b)."""
+        """x[1] = alpha b. Inside, s = -alpha phi and p = -alpha (psi - b)."""
         self._near.forget()
         self._xi[:] = xi
         self._load()
-        self.state[:] = self._ab
-        np.negative(self._ab, self._p)
+        self._p[:] = self.state
 
     def message(self, r: int) -> Array:
         """x[r+1]."""
         return self.state
 
     def exchange(self, r: int, received: Mapping[int, Array]) -> None:
-        """x[r+2]."""
-        s, p, y = self._s, self._p, self._y
+        """x[r+2] = (I - alpha M) x[r+1] + s + p."""
         self._near.receive(received)
-        self._near.combine(self._pull, s)
-        np.add(p, s, p)
+        self._near.combine(self._pull, self._s)
+        np.add(self._p, self._s, self._p)
         self._advance()
-        np.subtract(y, s, y)
-        np.subtract(y, p, self.state)
 
 
 def step_size(T: Array, inverse: Array | None, gamma: float, degree: float) -> float:
@@ -161,11 +157,11 @@ class Relaxed:
         solve = np.linalg.inv(inverse @ T.T @ T + c * degree * np.eye(n))
         self._near = Neighbourhood(hears, n * width)
         self.state = self._near.own
-        self._xi, self._b, self._pull = np.zeros(len(T) * width), np.zeros(n * width), np.zeros(n * width)
-        self._y = np.zeros(n * width)
+        self._xi, self._pull = np.zeros(len(T) * width), np.zeros(n * width)
         self._weights = self._near.weights(0.0, hears)
+        self._follow = ColumnProduct(c * solve, self._pull, self.state, more=1)
+        self._b = self._follow.added[0]
         self._load = ColumnProduct(solve @ inverse @ T.T, self._xi, self._b)
-        self._follow = ColumnProduct(c * solve, self._pull, self._y)
 
     def begin(self, xi: Array) -> None:
         """x_i as if every neighbour said zero."""
@@ -183,7 +179,6 @@ class Relaxed:
         self._near.receive(received)
         self._near.combine(self._weights, self._pull)
         self._follow()
-        np.add(self._b, self._y, self.state)
 
 
 def fusion_rounds(options: Mapping[str, Any]) -> int:
