@@ -12,14 +12,14 @@ machine has the same libraries open, and is shown.) Ends with 1 where something 
 from __future__ import annotations
 
 import argparse
-import statistics
 import sys
 import tempfile
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import rings
 from interleave import machine
 from page import Page
@@ -33,36 +33,36 @@ from duio_mesh.synthesis.design import Design
 SAMPLES = 200
 GROWTH = 0.02  # of memory that counts as flat
 TENTHS = ((0.1, 0.2), (0.9, 1.0))  # of the run that are compared
+NOT_SEEN = Memory(*[float("nan")] * len(Memory._fields))
 
 
 class Samples:
-    """The memory of every process at equal steps of progress."""
+    """The memory of every process at equal steps of progress, in an array that is there from the beginning."""
 
-    def __init__(self, steps: int) -> None:
-        self._steps, self._due = steps, 0
-        self.taken: list[tuple[float, dict[str, Memory]]] = []  # (part of the run, who -> memory)
+    def __init__(self, steps: int, nodes: Iterable[int], record: bool) -> None:
+        recorder = ["recorder"] if record else []
+        self.who = ["launcher", *(f"node-{i}" for i in nodes), "nursery", "plant", *recorder]
+        self._steps, self._due, self._count = steps, 0, 0
+        self._at = np.full(SAMPLES + 1, np.nan)  # part of the run
+        self._sizes = np.full((SAMPLES + 1, len(self.who), len(Memory._fields)), np.nan)
 
     def __call__(self, now: Progress) -> None:
         """Called by the launcher ten times a second."""
         if self._due <= now.steps < self._steps:
             self._due = now.steps + self._steps // SAMPLES
-            self.taken.append((now.steps / self._steps, memories()))
+            found = memories()
+            self._at[self._count] = now.steps / self._steps
+            for row, who in zip(self._sizes[self._count], self.who, strict=True):
+                row[:] = found.get(who, NOT_SEEN)
+            self._count += 1
 
     def within(self, who: str, first: float, last: float) -> Memory:
         """The medians over a part of the run. Raises SystemExit where it was never looked at."""
-        seen = [found[who] for at, found in self.taken if first <= at < last and who in found]
-        if not seen:
+        sizes = self._sizes[(self._at >= first) & (self._at < last), self.who.index(who)]
+        seen = sizes[~np.isnan(sizes[:, 0])]
+        if not len(seen):
             raise SystemExit(f"{who} was never looked at between {first:.0%} and {last:.0%} of the run: more --rounds")
-        return Memory(*(statistics.median(values) for values in zip(*seen, strict=True)))
-
-    def everybody(self) -> list[str]:
-        """Who was seen in the first and in the last of the two tenths, or in one of them."""
-        return sorted({who for at, found in self.taken if at >= TENTHS[0][0] for who in found}, key=_by_number)
-
-
-def _by_number(who: str) -> tuple[str, int]:
-    name, _, number = who.partition("-")
-    return name, int(number or 0)
+        return Memory(*np.median(seen, axis=0).tolist())
 
 
 def growths(page: Page, samples: Samples) -> list[str]:
@@ -72,7 +72,7 @@ def growths(page: Page, samples: Samples) -> list[str]:
     )
     page.say("|---|---|---|---|---|---|---|---|---|---|")
     grown = []
-    for who in samples.everybody():
+    for who in samples.who:
         early, late = (samples.within(who, *tenth) for tenth in TENTHS)
         cells = []
         for kind, before, after in zip(Memory._fields, early, late, strict=True):
@@ -112,7 +112,7 @@ def main() -> None:
     design = rings.admm_ring(args.nodes, steps, {"fusion": "finite_time"}, batch=args.batch)
     page = Page("scaling.md", "soak")
     page.say(f"{machine()}\n")
-    samples, begin = Samples(steps), time.monotonic()
+    samples, begin = Samples(steps, design.nodes, not args.no_record), time.monotonic()
     with tempfile.TemporaryDirectory() as out, Supervisor() as supervisor:
         result = launcher.run(design, Path(out) / "run", record=not args.no_record, show=samples, supervisor=supervisor)
         done = {who: process.done for who, process in supervisor.processes.items()}
