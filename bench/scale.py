@@ -1,6 +1,6 @@
 """Many sensor processes on one machine: rounds, start, memory, and the oracle's estimates, for rings of N nodes.
 
-    python bench/scale.py [--nodes 16 64 128] [--rounds 20000] [--repeat 5] [--record 64] [--write]
+    python bench/scale.py [--nodes 16 64 128] [--rounds 60000] [--repeat 5] [--record 64] [--write]
 
 The ring of bench/rings.py, `admm` with 199 rounds a step; N nodes do 4/N of the rounds, so that every run takes about
 as long. All N take turns in shuffled order. The speed is compared as rounds per second times N: on the same cores a
@@ -101,7 +101,7 @@ def main() -> None:
     """Interleave and print the tables; ends with 1 where a run differs from the oracle."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--nodes", type=int, nargs="*", default=[16, 64, 128], help="beside the ring of 4")
-    parser.add_argument("--rounds", type=int, default=20_000, help="of the ring of four; N nodes do 4/N of them")
+    parser.add_argument("--rounds", type=int, default=60_000, help="of the ring of four; N nodes do 4/N of them")
     parser.add_argument("--record", type=int, nargs="*", default=[64], help="rings that are run with a recorder, too")
     parser.add_argument(
         "--pinned", type=int, nargs="*", default=[64], help="rings that are cut into parts, a core for each"
