@@ -28,7 +28,7 @@ from duio_mesh.spec import NodeSpec
 from duio_mesh.tape import Tape
 
 NO_VECTOR = np.zeros(0)
-BEAT = 0.5  # seconds between signs of life inside a step
+BEATS = 5  # signs of life inside a step per deadline
 
 
 def run(spec: NodeSpec, report: Report) -> None:
@@ -53,8 +53,8 @@ def live(spec: NodeSpec, first: int, links: Links, journal: Journal, report: Rep
     samples = links.samples(first)
     if first not in acts:
         samples = chain((next(samples),), samples)  # the first may take its time: the others are still starting
-    begun, cpu = time.monotonic(), time.process_time()
-    rounds, promised, beat, steps = 0, first + spec.credit, begun + BEAT, spec.steps
+    begun, cpu, pause = time.monotonic(), time.process_time(), spec.deadline / BEATS
+    rounds, promised, beat, steps = 0, first + spec.credit, begun + pause, spec.steps
     for k in range(first, spec.steps, spec.batch):
         if k in acts:
             act_on_purpose(acts[k], links, journal, report)
@@ -71,7 +71,7 @@ def live(spec: NodeSpec, first: int, links: Links, journal: Journal, report: Rep
             observer.exchange(r, exchange(k, r, observer.message(r)))
             rounds += 1
             if (now := time.monotonic()) > beat:  # a step of many rounds may last longer than any deadline
-                beat = now + BEAT
+                beat = now + pause
                 links.credit.send(k, 0, NO_VECTOR)
                 report.beat()
         if len(figures := watched()):

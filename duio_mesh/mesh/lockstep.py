@@ -30,7 +30,7 @@ from duio_mesh.mesh.session import Member, Mesh, Outlet, Ready, Source
 
 ROOM = 4  # frames per step of the window that may wait
 FEW = 48  # numbers
-TICK = 0.1  # seconds between the watchdog's looks
+TICK = 0.1  # seconds between the watchdog's looks once somebody has gone; before, a quarter of what is soon
 SOON, PART = 1.0, 0.25  # a wait is worth a word after so many seconds, or this part of the deadline
 
 
@@ -118,6 +118,7 @@ class Lockstep:
         self.first = 0  # earlier steps' frames were meant for a process before this one
         self._at: tuple[Line, int, int] | None = None  # what the main thread waits for
         self._news, self._over = threading.Event(), False
+        self._tick = self._soon / 4
         self._watchdog = threading.Thread(target=self._watch, name="watchdog", daemon=True)
 
     def __enter__(self) -> Self:
@@ -228,13 +229,14 @@ class Lockstep:
         """A directly linked process came or went (``Mesh.watch``)."""
         if not alive:
             self._mesh.bury(member)
+            self._tick = min(TICK, self._tick)
             self._news.set()
 
     def _watch(self) -> None:
         """Say which waits last long, and end those that cannot end well."""
         seen, since, told = None, time.monotonic(), False
         while not self._over:
-            self._news.wait(TICK)
+            self._news.wait(self._tick)
             self._news.clear()
             at, now = self._at, time.monotonic()
             if at is not seen:
