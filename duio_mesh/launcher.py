@@ -17,6 +17,7 @@ from typing import Any, Protocol, TypeAlias
 import numpy as np
 
 from duio_mesh import credentials
+from duio_mesh.account import Account
 from duio_mesh.arrays import Array
 from duio_mesh.errors import RunError
 from duio_mesh.faults import COUNTED
@@ -29,10 +30,10 @@ from duio_mesh.report.trace_file import write_trace
 from duio_mesh.run_folder import RunFolder
 from duio_mesh.scenario.model import Scenario
 from duio_mesh.simulation import Trace, estimate_sizes, reconstructs, simulate
-from duio_mesh.spec import NodeSpec, PlantSpec, RecorderSpec, write_spec
+from duio_mesh.spec import AnySpec, NodeSpec, RecorderSpec, Wire, write_spec
 from duio_mesh.supervisor import Supervisor
 from duio_mesh.synthesis.design import Design
-from duio_mesh.wiring import LOOPBACK, Wired, Wiring, check_address
+from duio_mesh.wiring import LOOPBACK, Wiring, check_address
 
 CLOSING = 10.0  # seconds for the recorder to fill gaps and close its file ...
 CLOSING_ROWS = 50_000  # ... and a second more for every so many rows
@@ -78,6 +79,42 @@ class RunResult:
     warnings: tuple[str, ...]  # what went wrong without stopping the run
 
 
+def specs_of(
+    design: Design, folder: RunFolder, wires: Mapping[str, Wire], *, record: bool, live: bool
+) -> dict[str, AnySpec]:
+    """Every process' spec, with the endpoints and the files that it gets."""
+    sizes, run = estimate_sizes(design), design.scenario.run
+    source = "gateway" if design.plant.outside else "plant"
+    specs: dict[str, AnySpec] = {
+        source: replace(design.plant, wire=wires["plant"], output=str(folder.rows(source)), recorded=record)
+    }
+    for i, spec in design.nodes.items():
+        who = f"node-{i}"
+        inputs = str(folder.inputs(who)) if run.inputs else ""
+        specs[who] = replace(spec, wire=wires[who], output=str(folder.rows(who)), inputs=inputs)
+    if record:
+        specs["recorder"] = RecorderSpec(
+            name=design.scenario.name,
+            n=design.scenario.plant.n,
+            sizes=sizes,
+            arcs=tuple((a.source, a.target) for a in design.scenario.graph.arcs),
+            step=design.plant.step,
+            steps=design.plant.steps,
+            recording=str(folder.root / "recording.rrd"),
+            live=live,
+            description=describe(design.scenario, design.certificate),
+            truth=str(folder.rows("plant")),
+            estimates={i: str(folder.rows(f"node-{i}")) for i in sorted(design.nodes)},
+            unknown_inputs=reconstructs(design)[0],
+            flags=any(spec.without for spec in design.nodes.values()),
+            watch_step=getattr(design.scenario.options, "watch_step", None),
+            outside=design.plant.outside is not None,
+            tick=design.plant.tick,
+            wire=wires["recorder"],
+        )
+    return specs
+
+
 class Launch:
     """One run of a design over Zenoh on this host."""
 
@@ -90,53 +127,20 @@ class Launch:
         record: bool,
         live: bool,
         address: str = LOOPBACK,
-        wiring: Wired | None = None,
     ) -> None:
         self._design, self._folder, self._supervisor = design, folder, supervisor
         self._record, self._live = record, live
         self._sizes = estimate_sizes(design)
         self._url = ""  # of the live server, once the recorder has said it
-        self._wiring = wiring or Wiring(design, folder.keys, record=record, address=address)
-
-    def specs(self) -> dict[str, NodeSpec | PlantSpec | RecorderSpec]:
-        """Every process' spec, with endpoints that are reserved for it."""
-        design, folder, wires = self._design, self._folder, self._wiring.wires()
-        ids, who = sorted(design.nodes), "gateway" if design.plant.outside else "plant"
-        specs: dict[str, NodeSpec | PlantSpec | RecorderSpec] = {
-            who: replace(design.plant, wire=wires["plant"], output=str(folder.rows(who)), recorded=self._record)
-        }
-        for i, spec in design.nodes.items():
-            who = f"node-{i}"
-            inputs = str(folder.inputs(who)) if design.scenario.run.inputs else ""
-            specs[who] = replace(spec, wire=wires[who], output=str(folder.rows(who)), inputs=inputs)
-        if self._record:
-            specs["recorder"] = RecorderSpec(
-                name=design.scenario.name,
-                n=design.scenario.plant.n,
-                sizes=self._sizes,
-                arcs=tuple((a.source, a.target) for a in design.scenario.graph.arcs),
-                step=design.plant.step,
-                steps=design.plant.steps,
-                recording=str(folder.root / "recording.rrd"),
-                live=self._live,
-                description=describe(design.scenario, design.certificate),
-                truth=str(folder.rows("plant")),
-                estimates={i: str(folder.rows(f"node-{i}")) for i in ids},
-                unknown_inputs=reconstructs(design)[0],
-                flags=any(spec.without for spec in design.nodes.values()),
-                watch_step=getattr(design.scenario.options, "watch_step", None),
-                outside=design.plant.outside is not None,
-                tick=design.plant.tick,
-                wire=wires["recorder"],
-            )
-        return specs
+        self._wiring = Wiring(design, folder.keys, record=record, address=address)
 
     def go(self, show: Show, watcher: Watcher | None) -> None:
         """Start everybody and stay until plant and nodes are done. Raises RunError, or KeyboardInterrupt."""
         try:
             if not self._design.scenario.security.keep:
                 self._supervisor.forget(self._folder.keys)  # before there is anything in it
-            run, specs = self._design.scenario.run, self.specs()
+            run, wires = self._design.scenario.run, self._wiring.wires()
+            specs = specs_of(self._design, self._folder, wires, record=self._record, live=self._live)
             for who, spec in specs.items():
                 write_spec(spec, self._folder.spec(who))
                 self._supervisor.start(who, who.split("-")[0], *self._files(who))
@@ -283,10 +287,10 @@ def resolved(scenario: Scenario) -> str:
     return scenario_yaml(scenario, {"duio_mesh": __version__, "numpy": np.__version__})
 
 
-def gather(folder: RunFolder, design: Design, supervisor: Supervisor, seconds: float, failed: str) -> RunResult:
+def gather(folder: RunFolder, design: Design, account: Account, seconds: float, failed: str) -> RunResult:
     """The result from what the processes left; a recorder that was lost is made good from the trace."""
     trace = folder.gather(design)
-    said = {who: p.done for who, p in supervisor.processes.items()}
+    said = {who: p.done for who, p in account.processes.items()}
     nodes = [said[f"node-{i}"] for i in design.nodes if said.get(f"node-{i}")]
     rounds = max((node["rounds"] for node in nodes), default=0)
     took = max((node["seconds"] for node in nodes), default=seconds)
@@ -295,11 +299,11 @@ def gather(folder: RunFolder, design: Design, supervisor: Supervisor, seconds: f
         "rounds_per_second": rounds / took if took else 0.0,
         "messages": sum(node["frames"] for node in nodes),
         "rejected": {who: done["rejected"] for who, done in said.items() if done.get("rejected")},
-        "events": supervisor.events,
+        "events": account.events,
         "failure": failed,
     }
-    recorder = supervisor.processes.get("recorder")
-    warnings = [f"{p.who}: {text}" for p in supervisor.processes.values() for text in p.warnings]
+    recorder = account.processes.get("recorder")
+    warnings = [f"{p.who}: {text}" for p in account.processes.values() for text in p.warnings]
     warnings += _flagged(trace)
     if design.scenario.patchy:
         counts["faults"] = {what: sum(node["faults"].get(what, 0) for node in nodes) for what in COUNTED}

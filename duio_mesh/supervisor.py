@@ -20,6 +20,7 @@ from types import TracebackType
 from typing import Any, Self, TypeAlias
 
 from duio_mesh import diagnosis
+from duio_mesh.account import Account
 from duio_mesh.diagnosis import Process
 from duio_mesh.errors import RunError
 from duio_mesh.spec import PATIENCE, START
@@ -30,23 +31,17 @@ MARGIN = 2.0  # seconds beyond the deadline that a process has for saying itself
 GATHER = 0.3  # seconds after the first failure in which others may say what they saw
 END = 2.0  # seconds for asked processes to end before they are made to
 LONGER = PATIENCE + 1  # deadlines, where lost nodes are survived: their own waits may last PATIENCE of them
-TOLD = ("lost", "joined", "back", "dying", "pausing", "resumed", "waiting")
 THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
 Recover: TypeAlias = Callable[[Process], bool] | None
 
 
-class Supervisor:
+class Supervisor(Account):
     """The launcher's end of a nursery; a context manager that leaves no process behind."""
 
     def __init__(self) -> None:
         """Start the nursery; it gets ready by itself while the caller goes on."""
-        self.processes: dict[str, Process] = {}
-        self.events: list[dict[str, Any]] = []  # what has happened to nodes on the way
-        self.note = ""  # what a gateway waits for
-        self._begin = time.monotonic()
-        self._beats = 0  # whatever anybody says shows that things move ...
-        self._news = False  # ... and most of it may be worth doing something about at once
+        super().__init__()
         self._status, write = os.pipe()
         self._control, theirs = socket.socketpair()
         environment = os.environ | dict.fromkeys(THREADS, "1")
@@ -113,8 +108,8 @@ class Supervisor:
         begin = since = next_look = time.monotonic()
         seen, grown = (-1, 0), -1
         while not all(p.code == 0 for p in self._essential()):
-            self._until(lambda: self._news, FRAME)
-            self._news = False
+            self._until(lambda: self.news, FRAME)
+            self.news = False
             self._wake()
             for p in self._essential():
                 if p.code and recover and recover(p):
@@ -131,7 +126,7 @@ class Supervisor:
             if now >= next_look:
                 grown = look()
                 next_look = now + min(SELDOM, max(FRAME, (time.monotonic() - now) / SHARE))
-            if (news := (grown, self._beats)) != seen:
+            if (news := (grown, self.words)) != seen:
                 seen, since = news, now
             if recover:
                 self._end_the_stuck(deadline)
@@ -156,10 +151,6 @@ class Supervisor:
                 p.there = False
                 p.warnings.append("the run was over before it was back in step")
                 self.kill(p.who, signal.SIGKILL)
-
-    def waiting(self, few: int = diagnosis.FEW) -> str:
-        """Who waits for whom, in words (``diagnosis.in_words``)."""
-        return diagnosis.in_words(self.processes, few)
 
     def _who_waits(self) -> str:
         words = [self.waiting(), *diagnosis.stopped(self.processes, but=diagnosis.roots(self.processes))]
@@ -237,17 +228,4 @@ class Supervisor:
             return
         *lines, self._text[fd] = (self._text[fd] + data).split(b"\n")
         for line in lines:
-            self._hear(json.loads(line))
-
-    def _hear(self, event: dict[str, Any]) -> None:
-        self._beats += 1
-        self._news = self._news or event["event"] != "beat"
-        self.processes[event["who"]].hear(event, time.monotonic())
-        if (what := event["event"]) == "sensors":
-            self.note = event["text"]
-        if what in TOLD:
-            self.remember(what, **{key: value for key, value in event.items() if key != "event"})
-
-    def remember(self, what: str, **fields: Any) -> None:
-        """Keep an event for whoever wants to know afterwards what happened on the way."""
-        self.events.append({"seconds": round(time.monotonic() - self._begin, 3), "event": what, **fields})
+            self.hear(json.loads(line))

@@ -10,7 +10,6 @@ import ipaddress
 import secrets
 import socket
 from pathlib import Path
-from typing import Protocol
 
 from duio_mesh import credentials
 from duio_mesh.errors import ScenarioError
@@ -59,18 +58,6 @@ class Links:
     def tells(self, who: str) -> tuple[str, ...]:
         """Those that ``who`` has something to tell."""
         return tuple(other for other, heard in self.hears.items() if who in heard)
-
-
-class Wired(Protocol):
-    """Whoever knows the wire of every process."""
-
-    def wires(self) -> dict[str, Wire]:
-        """By process."""
-        ...
-
-    def release(self) -> None:
-        """The processes have started."""
-        ...
 
 
 class Wiring:

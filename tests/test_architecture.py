@@ -35,7 +35,7 @@ FLOORS = [
     ["report", "process"],
     ["links"],
     ["synthesis", "simulation", "node", "plant", "gateway", "recorder", "router", "health"],
-    ["nursery", "diagnosis", "supervisor", "run_folder", "schema", "credentials", "wiring", "limits"],
+    ["nursery", "diagnosis", "account", "supervisor", "run_folder", "schema", "credentials", "wiring", "limits"],
     ["recovery"],
     ["launcher"],
     ["api", "console", "generate", "replay", "deploy"],

@@ -6,11 +6,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from duio_mesh.deploy.logs import Logs
 from duio_mesh.deploy.places import Place, Sites
 from duio_mesh.deploy.wires import SiteWiring
 from duio_mesh.errors import ScenarioError
-from duio_mesh.launcher import Launch
+from duio_mesh.launcher import specs_of
 from duio_mesh.run_folder import RunFolder
 from duio_mesh.spec import AnySpec, RouterSpec, write_spec
 from duio_mesh.synthesis.design import Design
@@ -60,8 +59,8 @@ def pack(design: Design, sites: Sites, root: Path, start: float) -> list[Parcel]
     if design.plant.outside:
         raise ScenarioError(["plant: measurements from outside cannot be exported yet: their gateway has no place"])
     wiring = SiteWiring(design, sites, keys=root, secrets_at=SECRETS, start=start)
-    launch = Launch(design, _InContainer(Path(ROWS)), Logs(), record=sites.record, live=False, wiring=wiring)
-    specs: dict[str, AnySpec] = {**launch.specs(), **wiring.routers()}
+    specs = specs_of(design, _InContainer(Path(ROWS)), wiring.wires(), record=sites.record, live=False)
+    specs |= wiring.routers()
     places = {**sites.places, **sites.routers}
     parcels = []
     for who, spec in specs.items():

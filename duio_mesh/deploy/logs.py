@@ -4,20 +4,13 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
 
+from duio_mesh.account import Account
 from duio_mesh.diagnosis import Process
-from duio_mesh.supervisor import Supervisor
 
 
-class Logs(Supervisor):
-    """Knows processes by their logs; starts and ends none."""
-
-    def __init__(self) -> None:
-        self.processes = {}
-        self.events: list[dict[str, Any]] = []  # what happened to nodes on the way: nobody watched
-        self.note = ""
-        self._beats, self._begin = 0, 0.0
+class Logs(Account):
+    """Knows processes by their logs."""
 
     def read(self, who: str, log: Path) -> None:
         """Take in a process' log: JSON lines, as it wrote them to its log or to its standard output.
@@ -31,6 +24,6 @@ class Logs(Supervisor):
                 continue
             try:
                 event = json.loads(line)
-                self._hear({**event, "who": who})
+                self.hear({**event, "who": who})
             except (ValueError, KeyError, TypeError) as e:
                 raise ValueError(f"{log}:{number} is not an event of a process: {e}") from None

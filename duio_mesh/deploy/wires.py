@@ -58,9 +58,6 @@ class SiteWiring:
         """The spec of every router."""
         return {who: self._router(who, place) for who, place in self._sites.routers.items()}
 
-    def release(self) -> None:
-        """Nothing is held: the ports are on other hosts."""
-
     def _behind_router(self, who: str) -> Wire:
         router = self._sites.behind[who]
         at = self._endpoint(self._sites.routers[router].dial)

@@ -17,13 +17,14 @@ import zenoh
 
 import duio_mesh
 from duio_mesh import links, node
-from duio_mesh.launcher import Launch
+from duio_mesh.launcher import specs_of
 from duio_mesh.mesh import Encoder, Keys, Mesh, security
 from duio_mesh.run_folder import RunFolder
 from duio_mesh.spec import NodeSpec, Wire, write_spec
 from duio_mesh.supervisor import Supervisor
 from duio_mesh.synthesis.design import Design
 from duio_mesh.trace import Trace
+from duio_mesh.wiring import Wiring
 from tests.conftest import TOPOLOGIES
 
 ME, VICTIM, BETWEEN = "node-3", "node-2", 100  # BETWEEN: the step at which everybody waits for node 3
@@ -114,8 +115,8 @@ def besiege(
 
     with Supervisor() as supervisor:
         folder = RunFolder.create(design.scenario.name, Path("run"))
-        launch = Launch(design, folder, supervisor, record=False, live=False)
-        specs = launch.specs()
+        wiring = Wiring(design, folder.keys, record=False)
+        specs = specs_of(design, folder, wiring.wires(), record=False, live=False)
         for who, spec in specs.items():
             write_spec(spec, folder.spec(who))
             if who != ME:
@@ -126,7 +127,7 @@ def besiege(
         reached.get(timeout=30)
         try:
             assert failed.empty(), failed.get()
-            launch._wiring.release()
+            wiring.release()
             attack(Siege(meshes[0], specs, supervisor))
         finally:
             go_on.set()
