@@ -13,7 +13,7 @@ from typing import Any
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
-from rich.table import Table
+from rich.table import Column, Table
 
 from duio_mesh import launcher
 from duio_mesh.launcher import RunResult
@@ -25,6 +25,7 @@ from duio_mesh.synthesis.design import Design
 
 MANY = 16  # nodes or warnings, from which on only some are shown
 QUIET = 5.0  # seconds without a word about a design in a log
+RATE = len("10,000 steps/s")
 FEW = 8  # nodes whose errors are shown one by one
 
 _out = Console(highlight=False)
@@ -52,10 +53,12 @@ def working(on: str) -> Iterator[Callable[[str], None]]:
 @contextlib.contextmanager
 def progress(design: Design) -> Iterator[launcher.Show]:
     """A bar with steps, steps per second, and every node's newest error."""
+    steps = Column(no_wrap=True, min_width=2 * len(str(design.plant.steps)) + 1)
+    rate = Column(no_wrap=True, min_width=RATE)  # in a narrow terminal it is the errors that are cut short
     columns = (
         BarColumn(bar_width=12),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[rate]}"),
+        MofNCompleteColumn(table_column=steps),
+        TextColumn("{task.fields[rate]}", table_column=rate),
         TextColumn("{task.fields[errors]}"),
     )
     with Progress(*columns, console=_err) as bar:
@@ -111,7 +114,8 @@ class Watcher:
 def result(design: Design, result: RunResult, *, live: bool) -> None:
     """The table of errors, the verdict, and where everything is."""
     scenario, metrics = design.scenario, result.metrics
-    table = Table(title=f"{scenario.name}: {scenario.method}, {len(scenario.nodes)} nodes, {metrics['steps']} steps")
+    table = Table()
+    _out.print(f"[bold]{scenario.name}[/]: {scenario.method}, {len(scenario.nodes)} nodes, {metrics['steps']} steps")
     figures = {"RMS error": "rms", "final error": "final"}
     good, bad, what = "converged", "did not converge", "every node's RMS error"
     if scenario.outside:  # no truth, no error
