@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import struct
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Container, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Literal, NamedTuple, TypeAlias
 
@@ -272,6 +272,12 @@ class Reception:
     def without(self, j: int, k: int) -> bool:
         """Whether there is nobody at in-neighbour j's end in step k."""
         return j in self.gone or any(first <= k < after for first, after in self._absent[j])
+
+    def give_up(self, j: int, came: Container[tuple[int, int]]) -> list[Stamp]:
+        """In-neighbour j is lost: its frames on their long way that were never sent, because only ``came`` has come."""
+        never = [h for h in self._held if h.stamp.source == j and (h.stamp.k, h.stamp.r) not in came]
+        self._held = [h for h in self._held if h not in never]
+        return [h.stamp for h in never]
 
     def next(self, k: int, r: int) -> Arrivals:
         """What arrives in the exchange of step k, round r. To be asked once per exchange, in order.

@@ -72,13 +72,13 @@ class Journal:
         self._due = time.monotonic() + PERIOD
         if not self._filled:
             return
-        rows = self._rows[: self._filled]
+        first, rows = self._first, self._rows[: self._filled]
+        # before the rest: whoever stops us in it shall not pass the same rows on once more
+        self._first, self._filled = first + self._filled, 0
         if self._file:
             self._file.write(rows.astype("<f8", copy=False).tobytes())
             self._file.flush()
-        self._outlet.send(self._first, self._kind, rows)
-        self._first += self._filled
-        self._filled = 0
+        self._outlet.send(first, self._kind, rows)
 
 
 def _fill(path: Path, size: int, rows: int) -> None:

@@ -174,7 +174,8 @@ class Launch:
 
     def _look(self, show: Show, watcher: Watcher | None) -> int:
         """Show the progress; how many bytes all journals have grown to."""
-        if watcher and not self._url and (url := self._supervisor.processes["recorder"].said.get("url")):
+        recorder = self._supervisor.processes.get("recorder")
+        if watcher and recorder and not self._url and (url := recorder.said.get("url")):
             self._url = url
             watcher.started(url)
         files = {i: self._folder.rows(f"node-{i}") for i in self._sizes}

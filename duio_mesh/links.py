@@ -108,7 +108,7 @@ class Links:
                 self.told.send_to(spec.tells.index(j), k, HELLO, greeting(self.observer.estimate()))
             if j in spec.hears and isinstance(self.exchange, FaultyExchange):
                 self.heard[j].expect(before)
-                self.exchange.welcome(j)
+                self.exchange.welcome(j, k)
                 welcome(self.observer, j)
                 self._report("joined", node=j, k=k)
 
@@ -121,7 +121,7 @@ class Links:
         assert isinstance(lockstep, Lockstep)  # noqa: S101  (nobody comes back in real time)
         self.mesh.unanswered(RETURN)  # who does not answer is gone itself
         self._report("ready")
-        admission = ask(lockstep, self._plant, self.credit, spec.incarnation)
+        admission = ask(lockstep, self._plant, self.credit, spec.id, spec.incarnation)
         k = lockstep.first = admission.first
         self.observer = self.tape.follow(make_observer(replace(spec, steps=spec.steps - k)), k, spec.incarnation)
         told = [x for j in self.heard if (x := self._greeted(lockstep, j, admission)) is not None]

@@ -19,6 +19,7 @@ import signal
 import socket
 import sys
 import time
+import traceback
 from pathlib import Path
 from typing import Any
 
@@ -96,7 +97,7 @@ class Nursery:
         who = order["who"]
         if "prepare" in order:
             read, self._prepared[who] = os.pipe()
-            self._children[self._fork(order, read)] = who
+            self._start(order, read)
             os.close(read)
         elif who in self._prepared and "start" in order:
             pipe = self._prepared.pop(who)
@@ -104,16 +105,20 @@ class Nursery:
                 os.write(pipe, json.dumps(order).encode())
             os.close(pipe)
         elif "start" in order:
-            try:
-                self._children[self._fork(order)] = who
-            except OSError as e:
-                text = f"{who} cannot be started: {e.strerror} (memory, or the limit of processes: ulimit -u)"
-                self._tell({"event": "failed", "who": who, "text": text})
+            self._start(order)
         else:
             for pid in [pid for pid, name in self._children.items() if name == who]:
                 os.kill(pid, order["signal"])
 
-    def _fork(self, order: dict[str, Any], waits_on: int = -1) -> int:
+    def _start(self, order: dict[str, Any], waits_on: int = -1) -> None:
+        who = order["who"]
+        try:
+            self._children[self._fork(order, waits_on)] = who
+        except OSError as e:
+            text = f"{who} cannot be started: {e.strerror} (memory, or the limit of processes: ulimit -u)"
+            self._tell({"event": "failed", "who": who, "text": text})
+
+    def _fork(self, order: dict[str, Any], waits_on: int) -> int:
         """A child that obeys ``order``, or one that gets ready and then obeys what comes on ``waits_on``."""
         parent = os.getpid()
         pid = os.fork()
@@ -135,7 +140,8 @@ class Nursery:
                     os.close(pipe)
                 if waits_on >= 0:
                     importlib.import_module("duio_mesh.recorder")  # the half second that is worth preparing
-                    order = json.loads(os.read(waits_on, 4096) or "null")
+                    with os.fdopen(waits_on, "rb") as pipe_end:
+                        order = json.loads(pipe_end.read() or "null")
                     if order is None:
                         os._exit(0)  # the nursery closes before there was anything to do
                 errors = os.open(order["errors"], os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600)
@@ -144,6 +150,9 @@ class Nursery:
                 kind, run = KINDS[order["start"]]
                 report = Report(order["who"], self._status, Path(order["log"]))
                 code = live(kind, run, Path(order["spec"]), report)
+        except BaseException:
+            traceback.print_exc()  # into its .err file, once that is open
+            raise
         finally:
             sys.stderr.flush()
             os._exit(code)

@@ -126,6 +126,7 @@ class Credits:
                     if source.gone and self._done[i] < self._spec.steps:
                         source.gone = False
                         self.away.add(i)
+                        self._asking.pop(i, None)
             return
         i, frame = self._ids[got[0]], got[1]
         if frame.r == ASK:

@@ -71,6 +71,9 @@ def run(spec: RecorderSpec, report: Report) -> None:
             with suppress(Empty):
                 if got := mesh.get(PERIOD):
                     source, frame = got
+                    if not _fits(spec, node_of[source], frame):
+                        mesh.reject(source, "no rows of this run")
+                        continue
                     if ledger:
                         ledger.take(source.who, frame)
                     newest[source.who] = max(newest[source.who], _keep(recording, spec, node_of[source], frame))
@@ -93,6 +96,15 @@ def run(spec: RecorderSpec, report: Report) -> None:
         for who, lack in ledger.missing().items() if ledger else ():
             report.warn(f"{lack} of the {spec.steps} rows of {who} did not come")
     report("done", cpu_seconds=time.process_time(), rejected=mesh.rejections())
+
+
+def _fits(spec: RecorderSpec, node: int | None, frame: Frame) -> bool:
+    """Whether these are whole rows of steps that the run has."""
+    size = spec.n if node is None else spec.sizes[node]
+    if node is not None and frame.r in (ASIDE, MISSING):
+        size = COLUMNS if frame.r == ASIDE else 1
+    count, rest = divmod(frame.vector.size, size)
+    return not rest and frame.k + (1 if size == COLUMNS and frame.r == ASIDE else count) <= spec.steps
 
 
 def _keep(recording: Recording, spec: RecorderSpec, node: int | None, frame: Frame) -> int:

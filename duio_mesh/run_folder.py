@@ -10,10 +10,11 @@ keys/node-3/key.pem  ...                                                    remo
 
 from __future__ import annotations
 
-import os
+import contextlib
 import shutil
 from dataclasses import replace
 from datetime import UTC, datetime
+from itertools import chain, count
 from pathlib import Path
 
 import numpy as np
@@ -47,7 +48,6 @@ class RunFolder:
             home = Path("runs") / name
             home.mkdir(parents=True, exist_ok=True)
             root = _unused(home / datetime.now(UTC).strftime("%Y-%m-%dT%H-%M-%SZ"))
-            root.mkdir()
             _point(home / "latest", root.name)
         folder = cls(root.resolve())
         for sub in ("nodes", "logs", "rows"):
@@ -104,14 +104,17 @@ class RunFolder:
 
 
 def _unused(path: Path) -> Path:
-    """``path``, or path-2, path-3, ... when a run of the same second already has it."""
-    candidates = [path, *(path.with_name(f"{path.name}-{n}") for n in range(2, 1000))]
-    return next(p for p in candidates if not p.exists())
+    """Make the folder ``path``, or path-2, path-3, ... when a run of the same second already has it."""
+    for candidate in chain((path,), (path.with_name(f"{path.name}-{n}") for n in count(2))):
+        with contextlib.suppress(FileExistsError):
+            candidate.mkdir()
+            break
+    return candidate
 
 
 def _point(link: Path, target: str) -> None:
     """Make ``link`` a symbolic link to ``target``, replacing an old one in one step."""
-    fresh = link.with_name(f".{link.name}-{os.getpid()}")
+    fresh = link.with_name(f".{link.name}-{target}")
     fresh.symlink_to(target)
     fresh.replace(link)
 

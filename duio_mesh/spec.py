@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import os
 from collections.abc import Iterable, Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
 
@@ -204,6 +205,7 @@ _TYPES: dict[str, type[Any]] = {
     )
 }
 _ARRAY, _RECORD = 1, 2  # msgpack extension codes
+DEPTH = 8  # records within records, at most; a spec has four
 
 
 def _pack(value: Any) -> Any:
@@ -220,18 +222,21 @@ def _pack(value: Any) -> Any:
     raise TypeError(f"a spec cannot hold a {type(value).__name__}")
 
 
-def _unpack(code: int, data: bytes) -> Any:
+def _unpack(code: int, data: bytes, depth: int) -> Any:
+    if depth > DEPTH:
+        raise ValueError("its records are nested too deeply")
     if code == _ARRAY:
         shape, raw = msgpack.unpackb(data)
         return contiguous(np.frombuffer(raw, dtype="<f8").reshape(shape))
     if code == _RECORD:
-        name, fields = _load(data)
+        name, fields = _load(data, depth)
         return _TYPES[name](**fields)
     raise ValueError(f"unknown extension {code} in a spec")
 
 
-def _load(data: bytes) -> Any:
-    return msgpack.unpackb(data, ext_hook=_unpack, use_list=False, strict_map_key=False)
+def _load(data: bytes, depth: int = 0) -> Any:
+    hook = partial(_unpack, depth=depth + 1)
+    return msgpack.unpackb(data, ext_hook=hook, use_list=False, strict_map_key=False)
 
 
 def blocks(first: int, steps: int, block: int, breaks: Iterable[int] = ()) -> Iterator[range]:

@@ -153,9 +153,9 @@ class Tape:
         """Hand a chunk to the operating system, where it outlives this process."""
         self._due = time.monotonic() + PERIOD
         if self._buffer and self._file:
-            self._file.write(_CHUNK.pack(*_chunk_of(self._buffer)) + self._buffer)
+            chunk, self._buffer = self._buffer, bytearray()  # who stops us now shall not write it once more
+            self._file.write(_CHUNK.pack(*_chunk_of(chunk)) + chunk)
             self._file.flush()
-            self._buffer.clear()
 
 
 class Taped:
@@ -337,7 +337,7 @@ def _chunk_of(data: bytes | bytearray) -> tuple[int, ...]:
 
 def _record(fields: Any, path: Path, begin: int) -> Record:
     """The record that these fields make. Raises ValueError for anything that ``Tape`` does not write."""
-    with contextlib.suppress(ValueError, TypeError):
+    with contextlib.suppress(ValueError, TypeError, AttributeError, OverflowError):
         match fields:
             case (_Kind.SAMPLE, bytes(y), bytes(u)):
                 return Sample(_vector(y), _vector(u))

@@ -16,7 +16,7 @@ from duio_mesh.errors import ScenarioError
 from duio_mesh.journal import BATCH_BYTES
 from duio_mesh.scenario.model import Security
 from duio_mesh.simulation import estimate_sizes
-from duio_mesh.spec import Guard, Wire
+from duio_mesh.spec import LEASE, Guard, Wire
 from duio_mesh.synthesis.design import Design
 
 LOOPBACK = "127.0.0.1"
@@ -69,7 +69,7 @@ class Wiring:
         check_address(address, self._security)
         self._keys, self._address = keys, address
         self._run = secrets.token_hex(4)
-        self._limit = largest_frame(design)
+        self._limit, self._lease = largest_frame(design), lease(design)
         self._held: list[socket.socket] = []
         self._links = Links(design, record=record)
 
@@ -87,6 +87,7 @@ class Wiring:
                 listen=(at[who],) if who in at else (),
                 connect=tuple(at[other] for other in dialled),
                 guard=self._guard(who, folders[who]) if who in folders else None,
+                lease=self._lease,
             )
             for who, dialled in dials.items()
         }
@@ -114,6 +115,11 @@ class Wiring:
         s.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         s.bind((self._address, 0))
         return int(s.getsockname()[1])
+
+
+def lease(design: Design) -> float:
+    """Seconds after which a silent peer counts as gone: a process may be stopped, or a link down, for a deadline."""
+    return max(LEASE, design.plant.deadline)
 
 
 def largest_frame(design: Design) -> int:

@@ -15,12 +15,12 @@ class Logs(Account):
     def read(self, who: str, log: Path) -> None:
         """Take in a process' log: JSON lines, as it wrote them to its log or to its standard output.
 
-        Other lines (a container's log has its standard error, too) are passed over. Raises ValueError for JSON that is
-        no event.
+        Other lines (a container's log has its standard error, too) are passed over, and a last one that was cut short
+        when its host went down. Raises ValueError for JSON that is no event.
         """
         self.processes[who] = Process(who)
-        for number, line in enumerate(log.read_text(encoding="utf-8").splitlines(), 1):
-            if not line.startswith("{"):
+        for number, line in enumerate(log.read_text(encoding="utf-8").splitlines(keepends=True), 1):
+            if not line.startswith("{") or not line.endswith("\n"):
                 continue
             try:
                 event = json.loads(line)

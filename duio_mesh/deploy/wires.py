@@ -8,9 +8,9 @@ from pathlib import Path
 from duio_mesh import credentials
 from duio_mesh.deploy.places import Place, Sites
 from duio_mesh.errors import ScenarioError
-from duio_mesh.spec import LEASE, Guard, RouterSpec, Wire
+from duio_mesh.spec import Guard, RouterSpec, Wire
 from duio_mesh.synthesis.design import Design
-from duio_mesh.wiring import Links, check_address, largest_frame
+from duio_mesh.wiring import Links, check_address, largest_frame, lease
 
 
 class SiteWiring:
@@ -31,8 +31,7 @@ class SiteWiring:
         self._guarded = security.mode == "mtls"
         self._design, self._sites, self._links = design, sites, Links(design, record=sites.record)
         self._keys, self._secrets_at, self._start = keys, secrets_at, start
-        self._lease = max(LEASE, design.plant.deadline)  # a link may be down for as long as anyone may wait
-        self._run, self._limit = secrets.token_hex(4), largest_frame(design)
+        self._run, self._limit, self._lease = secrets.token_hex(4), largest_frame(design), lease(design)
 
     def wires(self) -> dict[str, Wire]:
         """The wire of every process but the routers. Credentials are written, for the routers as well."""

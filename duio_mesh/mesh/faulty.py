@@ -87,13 +87,23 @@ class FaultyExchange:
     def lose(self, j: int, k: int, r: int, why: str) -> None:
         """Do without in-neighbour j until ``welcome``."""
         self._reception.gone.add(j)
+        self._give_up(j, k, r)
         if j not in self._parted:
             self._part(j, k, r, why)
 
-    def welcome(self, j: int) -> None:
-        """In-neighbour j is there again; to be waited for from the coming step on."""
+    def welcome(self, j: int, k: int) -> None:
+        """In-neighbour j is there again; to be waited for from the coming step k on."""
         self._parted.discard(j)
         self._reception.gone.discard(j)
+        self._give_up(j, k, 0)  # where all its frames come late, nobody may have missed the process before this one
+
+    def _give_up(self, j: int, k: int, r: int) -> None:
+        """Expect no late frames of a dead process but those that it has sent, which are all here."""
+        line = self._heard[j]
+        self._read_past(line, k, r)
+        for stamp in self._reception.give_up(j, line.waiting):
+            del self._sizes[stamp]
+            line.excused.pop((stamp.k, stamp.r), None)
 
     def _part(self, j: int, k: int, r: int, why: str) -> None:
         self._parted.add(j)

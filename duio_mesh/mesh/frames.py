@@ -28,7 +28,7 @@ TAIL = 6  # bytes of the checksum element: bin8, its length, the checksum
 
 _STAMP = struct.Struct(">BIBI")  # uint32 k, uint32 r in msgpack's 0xce form
 _UINT32 = 0xCE
-_BIN8_OF_4 = b"\xc4\x04"
+BIN8_OF_4 = b"\xc4\x04"  # what stands before the checksum
 _CHECK = struct.Struct("<I")
 _LAYOUTS = 16  # frame lengths that a decoder remembers
 _BIN_HEADERS = ((0xC4, ">BB", 1 << 8), (0xC5, ">BH", 1 << 16), (0xC6, ">BI", 1 << 32))
@@ -77,7 +77,7 @@ class Encoder:
     def __call__(self, k: int, r: int, vector: Array) -> bytes:
         """The frame of step k, round r; ``vector`` is little-endian float64 (a block of rows goes row by row)."""
         payload = vector.tobytes()
-        body = self._prefix + stamp(k, r, len(payload)) + payload + _BIN8_OF_4
+        body = self._prefix + stamp(k, r, len(payload)) + payload + BIN8_OF_4
         return body + _CHECK.pack(crc32(body))
 
 
@@ -101,7 +101,7 @@ class Decoder:
         if crc32(data) != RESIDUE:
             raise Rejected("checksum")
         end = layout.start + 8 * layout.numbers
-        if k_form != _UINT32 or r_form != _UINT32 or header != layout.header or data[end : end + 2] != _BIN8_OF_4:
+        if k_form != _UINT32 or r_form != _UINT32 or header != layout.header or data[end : end + 2] != BIN8_OF_4:
             raise Rejected("layout")
         if not all(map(isfinite, layout.payload.unpack_from(data, layout.start))):
             raise Rejected("not finite")

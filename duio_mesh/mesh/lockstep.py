@@ -25,7 +25,7 @@ import zenoh
 
 from duio_mesh.arrays import Array
 from duio_mesh.errors import RunError
-from duio_mesh.mesh.frames import FLOAT64, RESIDUE, TAIL, Decoder, Frame, Rejected, prefix, stamp
+from duio_mesh.mesh.frames import BIN8_OF_4, FLOAT64, RESIDUE, TAIL, Decoder, Frame, Rejected, prefix, stamp
 from duio_mesh.mesh.session import Member, Mesh, Outlet, Ready, Source
 
 ROOM = 4  # frames per step of the window that may wait
@@ -97,7 +97,8 @@ class Line(Source):
     def expect(self, before: int) -> None:
         """The other end is the process that replaces so many others."""
         self.before, self.gone = before, False
-        self.gone = not self._mesh.alive(Member(self.who, before))  # in this order, no death goes unnoticed
+        if not self._mesh.alive(Member(self.who, before)):  # a death before this look; a later one buries this line
+            self.gone = True
 
     def knock(self) -> None:
         """Let ``receive`` return ``token``, after everything that has come."""
@@ -145,11 +146,14 @@ class Lockstep:
         self._at = (line, k, r)
         while True:
             if line.waiting and (held := self._held(line, k, r, size)) is not None:
+                line.last = (k, r)
+                self._at = None
                 return held
             data: bytes = line.receive().payload.to_bytes()
             if (
                 data.startswith(expected)
                 and len(data) == start + form.rest
+                and data.startswith(BIN8_OF_4, -TAIL)
                 and crc32(data) == RESIDUE
                 and form.finite(data, start)
             ):

@@ -41,13 +41,18 @@ class Admission(NamedTuple):
     away: tuple[int, ...]  # nodes that are not there
 
 
-def ask(lockstep: Lockstep, plant: Line, credit: Outlet, incarnation: int) -> Admission:
-    """Ask to take part again, and wait for the answer. Raises RunError when the plant is lost or silent."""
+def ask(lockstep: Lockstep, plant: Line, credit: Outlet, node: int, incarnation: int) -> Admission:
+    """Ask to take part again, and wait for the answer. Raises RunError when the plant is lost or silent.
+
+    An answer to the process before this one, which was lost while it waited, is passed over.
+    """
     credit.send(incarnation, ASK, NO_VECTOR)
-    away = lockstep.next_of(plant, AWAY).vector
-    joined = lockstep.next_of(plant, JOINED)
-    data = lockstep.next_of(plant, YOURS).vector
-    return Admission(joined.k, data, come_back(joined.vector), tuple(int(i) for i in away))
+    while True:
+        away = lockstep.next_of(plant, AWAY).vector
+        joined = lockstep.next_of(plant, JOINED)
+        data = lockstep.next_of(plant, YOURS).vector
+        if (back := come_back(joined.vector)).get(node) == incarnation:
+            return Admission(joined.k, data, back, tuple(int(i) for i in away))
 
 
 def come_back(rows: Array) -> dict[int, int]:

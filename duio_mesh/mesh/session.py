@@ -49,6 +49,8 @@ def configured(wire: Wire) -> zenoh.Config:
         "connect/timeout_ms": int(wire.start * 1000),
         "connect/exit_on_failure": True,
         "transport/link/tx/lease": int(wire.lease * 1000),
+        # microseconds; else BLOCK gives up a peer that takes nothing after five seconds, and all that is queued for it
+        "transport/link/tx/queue/congestion_control/block/wait_before_close": int(wire.lease * 1_000_000),
         "open/return_conditions/connect_scouted": False,  # else every open waits half a second for scouting
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
@@ -320,7 +322,8 @@ class Mesh:
     def bury(self, member: Member) -> None:
         """Nothing will come any more from this process, or from one before it."""
         for s in self.sources:
-            s.gone = s.gone or (s.who == member.who and s.before <= member.before)
+            if s.who == member.who and s.before <= member.before:
+                s.gone = True
 
     def reject(self, source: Source, cause: str) -> None:
         """Count a refused frame; the first of its kind is worth a line in the log."""

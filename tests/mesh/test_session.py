@@ -161,3 +161,19 @@ def test_scouting_is_off(line: tuple[Mesh, Mesh, Mesh]) -> None:
     peers = [{str(z) for z in m._session.info.peers_zid()} for m in line]
     zids = [str(m._session.info.zid()) for m in (one, two, three)]
     assert peers == [{zids[1]}, {zids[0], zids[2]}, {zids[1]}]
+
+
+def test_a_frame_that_was_kept_ends_its_wait(line: tuple[Mesh, Mesh, Mesh]) -> None:
+    """Else the watchdog goes on about it, and the messages say that nothing was ever sent."""
+    a, b, _ = line
+    told = a.speak([(a.keys.edge(1, 2), "1 -> 2", (1, 2))])
+    heard = Line(b, b.keys.edge(1, 2), "1 -> 2", "node-1", (1, 2), 4)
+    a.meet()
+    lockstep = Lockstep(b, 5.0)
+    with lockstep:
+        for k in (1, 0):
+            told.send(k, 0, np.ones(1))
+        for k in (0, 1):
+            lockstep.take(heard, k, 0, 1)
+    assert lockstep._at is None
+    assert heard.last == (1, 0)

@@ -232,3 +232,23 @@ def test_a_run_that_takes_too_long() -> None:
         assert "node-2 waits for node-1 (edge 1 -> 2, step 0, round 0)" in run.stderr
         assert "node-1 is stopped" in run.stderr
         assert "max_seconds" in run.metrics()["failure"]
+
+
+@pytest.mark.parametrize("policy", ["degrade", "restart"])
+def test_a_lost_node_whose_frames_were_to_come_late(policy: str) -> None:
+    """What it had not sent yet is waited for neither from it nor from the process that takes its place."""
+    late = "faults={links: [{delay: {steps: 200}}]}"
+    with Running("ring.yaml", *asked(policy, late, "run.deadline=3.0"), steps=12_000) as run:
+        run.until_row("node-2", 1000)
+        run.send("node-2", signal.SIGKILL)
+        assert run.end() in (0, 1), run.stderr
+        assert len(read_trace(run.out / "trace.npz").t) == 12_000
+
+
+def test_a_pause_within_the_deadline_is_survived_however_long_the_deadline_is() -> None:
+    """Zenoh's own patience with a peer that says nothing is ten seconds, unless somebody may wait longer."""
+    pause = "faults={nodes: [{node: 2, pause: 100, seconds: 11}]}"
+    with Running("ring.yaml", "--no-record", "--set", "run.deadline=30", "--set", pause, steps=200) as run:
+        assert run.end() == 0, run.stderr
+    expected = duio_mesh.simulate(design_of("ring", {"nodes": []}, **{"run.steps": 200}))
+    assert read_trace(run.out / "trace.npz").xhat.tobytes() == expected.xhat.tobytes()
