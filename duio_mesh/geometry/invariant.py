@@ -65,8 +65,8 @@ def infimal_invariant(C: Array, A: Array, B: Array, rtol: float = RTOL) -> Array
 
 
 def _infimal_invariant(C: Array, A: Array, B: Array, rtol: float) -> tuple[Array, Rank]:
-    C, size = unit_rows(C, rtol), norm(A)
-    W, margin = add_with_margin(np.zeros((A.shape[0], 0)), unit_columns(B, rtol), rtol)
+    C, size = unit_rows(C), norm(A)
+    W, margin = add_with_margin(np.zeros((A.shape[0], 0)), unit_columns(B), rtol)
     while True:  # grows at every turn, so at most n turns
         hidden, decided = kernel_with_margin(C @ W, rtol, scale=1.0)
         grown, added = add_with_margin(W, A @ (W @ hidden), rtol, scale=size)
@@ -86,7 +86,7 @@ def infimal_unobservability(C: Array, A: Array, W: Array, rtol: float = RTOL) ->
 
 def _infimal_unobservability(C: Array, A: Array, W: Array, rtol: float) -> tuple[Array, Rank]:
     n, size = A.shape[0], norm(A)
-    K, margin = kernel_with_margin(unit_rows(C, rtol), rtol, scale=1.0)
+    K, margin = kernel_with_margin(unit_rows(C), rtol, scale=1.0)
     S: Array = np.eye(n)
     for _ in range(n + 2):
         back, decided = kernel_with_margin(residual(S, A @ K), rtol, scale=size)
@@ -107,7 +107,7 @@ def friend(C: Array, A: Array, W: Array, rtol: float = RTOL) -> Array:
     Raises GeometryError when W is not (C,A)-invariant: A (W and Ker C) sticks out of W by more than the tolerance.
     """
     P, size = quotient(W), norm(A)
-    hidden = kernel(unit_rows(C, rtol) @ W, rtol, scale=1.0)
+    hidden = kernel(unit_rows(C) @ W, rtol, scale=1.0)
     stuck = norm(P @ A @ W @ hidden)
     if stuck > _CHAIN * rtol * size:
         raise GeometryError(

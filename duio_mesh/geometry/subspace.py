@@ -158,17 +158,20 @@ def contains(W: Array, V: Array, rtol: float = RTOL) -> bool:
     return excess(V, W) <= rtol
 
 
-def unit_rows(C: Array, rtol: float = RTOL) -> Array:
-    """C with every row scaled to length 1: the same kernel, without units.
+def unit_rows(C: Array, rounding: float = 0.0) -> Array:
+    """C with every row that is not exactly zero scaled to length 1: the same kernel, without units.
 
-    Rows shorter than rtol times the longest are dropped.
+    A row's length carries only its unit, so rows of data are never compared with each other: what looks negligible may
+    be a quantity in large units. ``rounding`` is for rows that a computation with errors of that size, relative to the
+    largest entry, has produced: shorter ones are dropped too.
     """
-    lengths: Array = np.linalg.norm(C, axis=1)
-    keep = lengths > rtol * lengths.max(initial=0.0)
-    scaled: Array = C[keep] / lengths[keep, None]
-    return scaled
+    largest: Array = np.abs(C).max(axis=1, initial=0.0)
+    keep = largest > rounding * largest.max(initial=0.0)
+    # by a power of 2 first, which changes no digit, so that the squares of tiny entries do not underflow
+    rows: Array = np.ldexp(C[keep], -np.frexp(largest[keep])[1][:, None])
+    return rows / np.asarray(np.linalg.norm(rows, axis=1))[:, None]
 
 
-def unit_columns(B: Array, rtol: float = RTOL) -> Array:
-    """B with every column scaled to length 1, negligible ones dropped: same image, no units."""
-    return unit_rows(B.T, rtol).T
+def unit_columns(B: Array, rounding: float = 0.0) -> Array:
+    """B with every column that is not exactly zero scaled to length 1: same image, no units."""
+    return unit_rows(B.T, rounding).T

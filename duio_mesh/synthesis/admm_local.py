@@ -23,6 +23,7 @@ from duio_mesh.geometry import (
 )
 from duio_mesh.scenario.model import Normal, Scenario
 from duio_mesh.synthesis.admm_options import Options
+from duio_mesh.synthesis.uio import check_decoupled
 
 LEAST_CURVATURE = 1e-10
 """Assumption 2 fails below this ratio of H's extreme eigenvalues: H^-1 would have no correct digit left to spare."""
@@ -53,6 +54,7 @@ def local_estimates(scenario: Scenario, options: Options) -> dict[int, Local]:
             filter_ = reduced_observer(node.C, A, structure.Wg, stability, options.poles, structure.L)
         except GeometryError as e:
             raise DesignError(f"node {i}: no local estimate (5): {e}") from None
+        check_decoupled(np.eye(len(A)) - structure.W @ structure.W.T, scenario, i)
         P = filter_.P
         x0 = scenario.plant.x0
         start = x0.mean if isinstance(x0, Normal) else x0

@@ -33,6 +33,7 @@ from duio_mesh.synthesis.sampled import (
     modes,
     sampled,
 )
+from duio_mesh.synthesis.uio import check_decoupled
 
 RADIUS_OF = "sampled error system, per tick; the larger of two: sign term saturated, and around zero"
 
@@ -71,6 +72,8 @@ def design(scenario: Scenario, progress: Progress) -> Design:
         progress(f"node {i}: subspaces and local gains")
         args = node.C, plant.A, scenario.known(i), scenario.unknown(i)
         nodes[i] = local_uio(*args, options.poles, options.kappa, f"node {i}")
+        W = nodes[i].structure.W
+        check_decoupled(np.eye(plant.n) - W @ W.T, scenario, i)
     conditions = _conditions(scenario, nodes)
     progress("choosing the coupling")
     L, h = graph.laplacian(), plant.step

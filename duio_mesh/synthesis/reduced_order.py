@@ -6,18 +6,19 @@ disturbances, are the unknown input f that every node reconstructs beside the st
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from pydantic import Field, PositiveFloat
+from pydantic import NonNegativeFloat, PositiveFloat
 from scipy import linalg
 from scipy.sparse.csgraph import connected_components
 
 from duio_mesh.arrays import Array
 from duio_mesh.errors import DesignError
 from duio_mesh.geometry.stability import spectral_radius
-from duio_mesh.geometry.subspace import norm
+from duio_mesh.geometry.staircase import detectability_decomposition
+from duio_mesh.geometry.subspace import GeometryError, norm
 from duio_mesh.scenario.model import Graph, Scenario
 from duio_mesh.spec import NodeSpec
 from duio_mesh.synthesis.design import Design, Progress, node_spec, plant_spec
@@ -25,8 +26,10 @@ from duio_mesh.synthesis.reduced_order_local import (
     WORST_CONDITION,
     Interval,
     Model,
+    RateError,
     Separated,
     Split,
+    hidden_from,
     interval,
     local_observer,
     separate,
@@ -47,16 +50,19 @@ from duio_mesh.synthesis.sampled import (
 
 RADIUS_OF = "sampled error system, per tick"
 
+_SIGMAS = (0.5, 0.0)  # of auto: hand slow modes to the network, or only those that a node must hand over
+_RATES = tuple(3.0 / 2**k for k in range(13))  # of auto: down to 7e-4 1/s, time constants of half an hour
+
 
 class Options(HoldOptions):
     """The keys under ``observer:`` for ``method: reduced_order``."""
 
     c: PositiveFloat | Literal["auto"] = "auto"
     """Coupling gain, 1/s. ``auto``: the smallest one whose sampled error decays about as fast as any."""
-    sigma: float = Field(default=0.5, ge=0)
-    """1/s. Invisible modes with Re >= -sigma are left to the network; 0 is the paper's literal split."""
-    rate: PositiveFloat = 3.0
-    """1/s. Visible modes are moved left of -rate."""
+    sigma: NonNegativeFloat | Literal["auto"] = "auto"
+    """1/s. Invisible modes with Re >= -sigma are left to the network (0: the paper). ``auto``: 0.5, or 0 if need be."""
+    rate: PositiveFloat | Literal["auto"] = "auto"
+    """1/s. Visible modes are moved left of -rate. ``auto``: 3, halved until reliable gains exist."""
     kappa: PositiveFloat = 5.0
     """1/s. M = -kappa I of the interval observer; larger amplifies state errors in the unknown input."""
     bounds: tuple[tuple[float, float], ...] | None = None
@@ -79,48 +85,137 @@ class _Node(NamedTuple):
         return Coupled(F, K, c * (s.V2 @ self.gains.Tu).T, X)
 
 
+class _Network(NamedTuple):
+    """All nodes with gains for one sigma and rate, and their error system as a function of the coupling gain c."""
+
+    sigma: float
+    rate: float
+    nodes: Mapping[int, _Node]
+    laplacian: Array
+    options: Options
+    bound: float | None  # (13)
+    spread: float | None  # least eigenvalue of Y'(L^ kron I)Y
+
+    def steps(self, h: float) -> dict[int, Step]:
+        """Every node's own part over a tick of h seconds."""
+        return {i: sampled(node.local, h, self.options) for i, node in self.nodes.items()}
+
+    def growth(self, c: float) -> float:
+        """Abscissa of the errors in continuous time."""
+        return abscissa(error_system([node.coupled(c, None) for node in self.nodes.values()], self.laplacian))
+
+    def radius(self, c: float, steps: Mapping[int, Step]) -> float:
+        """Spectral radius of the errors on samples."""
+        coupled = [node.coupled(c, steps[i]) for i, node in self.nodes.items()]
+        return spectral_radius(error_system(coupled, self.laplacian))
+
+
+class _Coupled(NamedTuple):
+    """The network with its coupling gain."""
+
+    network: _Network
+    steps: Mapping[int, Step]
+    c: float
+
+    def radius(self, h: float) -> float:
+        """Spectral radius of the errors at another step."""
+        return self.network.radius(self.c, self.network.steps(h))
+
+
 def design(scenario: Scenario, progress: Progress) -> Design:
     """Gains, conditions and node specs.
 
     Raises DesignError, with numbers and node names, when the plant is not continuous, nodes know different inputs,
-    Assumption 1 or 2 fails, the graph does not connect the nodes that need help, the coupling cannot reach a direction
-    that no node sees (sufficient condition), or the coupling is unstable at this step.
+    Assumption 1 or 2 fails, observer.rate asks for unreliable gains, the graph does not connect the nodes that need
+    help, the coupling cannot reach a direction that no node sees (sufficient condition), or the coupling is unstable at
+    this step.
     """
-    options: Options = scenario.options
     D, unknown = _unknown_input(scenario)
-    low, high = _bounds(options, D.shape[1])
-    plant, h, L = scenario.plant, scenario.plant.step, scenario.graph.laplacian()
-    nodes = {}
+    _bounds(scenario.options, D.shape[1])
+    plant, separated = scenario.plant, {}
     for i, node in scenario.nodes.items():
         progress(f"node {i}: removing noise and unknown input")
-        s = separate(Model(plant.A, scenario.known(i), D, node.C, node.noise.channel), f"node {i}", unknown)
-        gains, bounds = split(s, options.sigma, options.rate, f"node {i}"), interval(s, low, high)
-        nodes[i] = _Node(s, gains, bounds, local_observer(s, gains, bounds, options.kappa))
-    _jointly_detectable(scenario, D, nodes, unknown)
-    bound, spread = _network(scenario.graph, L, nodes, options.sigma)
-    progress("choosing the coupling")
-    steps = {i: sampled(node.local, h, options) for i, node in nodes.items()}
-
-    def growth(c: float) -> float:
-        return abscissa(error_system([node.coupled(c, None) for node in nodes.values()], L))
-
-    def rho(c: float, at: float = h) -> float:
-        exact = steps if at == h else {i: sampled(node.local, at, options) for i, node in nodes.items()}
-        return spectral_radius(error_system([node.coupled(c, exact[i]) for i, node in nodes.items()], L))
-
-    c = choose_gain("c", options.c, growth, rho, h, L)
+        model = Model(plant.A, scenario.known(i), D, node.C, node.noise.channel)
+        separated[i] = separate(model, f"node {i}", unknown)
+    _jointly_detectable(scenario, D, separated, unknown)
+    chosen = _choose(scenario, separated, progress)
+    network, steps, c = chosen
     certificate = {
-        "conditions": _conditions(nodes, spread),
-        "nodes": {i: _facts(node) for i, node in nodes.items()},
-        "spectral_abscissa": growth(c),
-        "sampled_radius": rho(c),
+        "conditions": _conditions(network.nodes, network.spread),
+        "nodes": {i: _facts(node) for i, node in network.nodes.items()},
+        "spectral_abscissa": network.growth(c),
+        "sampled_radius": network.radius(c, steps),
         "c": c,
-        "c_bound_13": bound,
-        "step": h,
-        "largest_step": largest_step(lambda at: rho(c, at), h),
+        "sigma": network.sigma,
+        "rate": network.rate,
+        "c_bound_13": network.bound,
+        "step": plant.step,
+        "largest_step": largest_step(chosen.radius, plant.step),
     }
-    specs = {i: _spec(scenario, i, node, steps[i], c) for i, node in nodes.items()}
+    specs = {i: _spec(scenario, i, node, steps[i], c) for i, node in network.nodes.items()}
     return Design(scenario, plant_spec(scenario), specs, certificate)
+
+
+def _choose(scenario: Scenario, separated: Mapping[int, Separated], progress: Progress) -> _Coupled:
+    """The first sigma with which gains and coupling exist, and with it the first rate.
+
+    The two are independent: the rate concerns what a node sees, sigma and c what it does not see. A given c is judged
+    with the first sigma that has gains: changing sigma behind it would hide that it is too strong for the step.
+    Raises DesignError with the reason of the last attempt and the values that were tried.
+    """
+    options: Options = scenario.options
+    sigmas = _SIGMAS if options.sigma == "auto" else (options.sigma,)
+    for sigma in sigmas:
+        try:
+            network = _with_gains(scenario, separated, sigma, progress)
+            if options.c == "auto":
+                return _coupled(network, scenario, progress)
+            break
+        except DesignError as e:
+            if sigma == sigmas[-1]:
+                tried = " (observer.sigma: auto tried 0.5 and 0)" if len(sigmas) > 1 else ""
+                raise DesignError(f"{e}{tried}") from None
+            progress(f"observer.sigma = {sigma:g} does not hold; trying 0")
+    return _coupled(network, scenario, progress)
+
+
+def _with_gains(scenario: Scenario, separated: Mapping[int, Separated], sigma: float, progress: Progress) -> _Network:
+    """The nodes' gains with the first rate that they can hold. Raises DesignError when none is or ``_network`` does."""
+    options: Options = scenario.options
+    rates = _RATES if options.rate == "auto" else (options.rate,)
+    for rate in rates:
+        try:
+            nodes = dict(_nodes(options, separated, sigma, rate))
+            break
+        except RateError as e:
+            if rate == rates[-1]:
+                tried = f" (observer.rate: auto tried {rates[0]:g} halved down to {rate:.2g})" if len(rates) > 1 else ""
+                raise DesignError(f"{e}{tried}") from None
+    L = scenario.graph.laplacian()
+    bound, spread = _network(scenario.graph, L, nodes, sigma)
+    if (sigma, rate) != (_SIGMAS[0], _RATES[0]):
+        progress(f"gains for observer.sigma = {sigma:g}, observer.rate = {rate:.4g}")
+    return _Network(sigma, rate, nodes, L, options, bound, spread)
+
+
+def _nodes(
+    options: Options, separated: Mapping[int, Separated], sigma: float, rate: float
+) -> Iterator[tuple[int, _Node]]:
+    for i, s in separated.items():
+        gains, bounds = split(s, sigma, rate, f"node {i}"), interval(s, *_bounds(options, s.D1.shape[1]))
+        yield i, _Node(s, gains, bounds, local_observer(s, gains, bounds, options.kappa))
+
+
+def _coupled(network: _Network, scenario: Scenario, progress: Progress) -> _Coupled:
+    """The network with the coupling gain of the file, or the one that ``auto`` finds."""
+    progress("choosing the coupling")
+    h = scenario.plant.step
+    steps = network.steps(h)
+
+    def rho(c: float, at: float) -> float:
+        return network.radius(c, steps if at == h else network.steps(at))
+
+    return _Coupled(network, steps, choose_gain("c", network.options.c, network.growth, rho, h, network.laplacian))
 
 
 def error_radius(design: Design, graph: Graph) -> float:
@@ -148,11 +243,12 @@ def _unknown_input(scenario: Scenario) -> tuple[Array, list[str]]:
     D = scenario.unknown(first)
     unknown = [name for name in plant.inputs if name not in known[first]]
     unknown += [f"disturbance {k + 1}" for k in range(plant.E.shape[1])]
-    seen = np.linalg.svd(D, compute_uv=False)
+    lengths = np.linalg.norm(D, axis=0)
+    seen = np.linalg.svd(D / np.where(lengths > 0, lengths, 1.0), compute_uv=False)  # whatever the inputs' units
     if D.shape[1] and (D.shape[1] > plant.n or seen[-1] <= 1e-9 * seen[0]):
         raise DesignError(
-            f"the unknown inputs ({', '.join(unknown)}) do not enter independently: singular values of D are "
-            f"{np.array2string(seen, precision=3)}; combine dependent columns"
+            f"the unknown inputs ({', '.join(unknown)}) do not enter independently: singular values of D "
+            f"(columns of length 1) are {np.array2string(seen, precision=3)}; combine dependent columns"
         )
     return D, unknown
 
@@ -165,13 +261,18 @@ def _bounds(options: Options, q: int) -> tuple[Array, Array]:
     return low, high
 
 
-def _jointly_detectable(scenario: Scenario, D: Array, nodes: Mapping[int, _Node], unknown: list[str]) -> None:
-    """Assumption 1: all nodes' noise-free measurements together leave no unstable invariant zero."""
+def _jointly_detectable(scenario: Scenario, D: Array, separated: Mapping[int, Separated], unknown: list[str]) -> None:
+    """Assumption 1: all nodes' noise-free measurements together leave no unstable invariant zero.
+
+    A rank condition, so no gain is computed. Raises DesignError with the modes that are left.
+    """
     plant = scenario.plant
-    W = [np.vstack([s.separated.W1, s.separated.W2]) @ scenario.nodes[i].C for i, s in nodes.items()]
-    C = np.vstack(W)
-    together = Model(plant.A, plant.B, D, C, np.zeros((C.shape[0], 0)))
-    left = split(separate(together, "all nodes together", unknown), 0.0, 1e-3, "all nodes together").undetectable
+    C = np.vstack([np.vstack([s.W1, s.W2]) @ scenario.nodes[i].C for i, s in separated.items()])
+    s = separate(Model(plant.A, plant.B, D, C, np.zeros((C.shape[0], 0))), "all nodes together", unknown)
+    try:
+        left = detectability_decomposition(s.C22, s.A22, hidden_from(0.0)).eigenvalues
+    except GeometryError as e:
+        raise DesignError(f"all nodes together: {e}") from None
     if left.size:
         raise DesignError(
             f"Assumption 1 fails: with the unknown inputs acting, all measurements together do not show the modes at "
@@ -209,8 +310,9 @@ def _network(graph: Graph, L: Array, nodes: Mapping[int, _Node], sigma: float) -
         raise DesignError(
             f"{common} direction(s) of the state are left to the network by every node, so no coupling can reach them: "
             f"the least eigenvalue of Y'(L^ kron I)Y is {spread:.2g} (must be positive), direction "
-            f"{np.round(direction / np.linalg.norm(direction), 4).tolist()}. A node leaves its invisible modes "
-            f"with Re >= {-sigma:g} to the network; a smaller observer.sigma or one more measurement may help"
+            f"{np.round(direction / np.linalg.norm(direction), 4).tolist()}. With observer.sigma = {sigma:g} a node "
+            f"leaves its invisible modes with Re >= {-sigma + 0.0:g} to the network; "
+            f"{'a smaller observer.sigma or ' if sigma else ''}one more measurement may help"
         )
     return float(np.linalg.eigvalsh(RA + RA.T)[-1]) / spread, spread
 

@@ -6,7 +6,7 @@ The seed's formulas (1)-(26) are lost in its text; letters and numbers here foll
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from duio_mesh.arrays import Array
 from duio_mesh.errors import DesignError
 from duio_mesh.geometry.injection import stabilise
-from duio_mesh.geometry.stability import stable_abscissa
+from duio_mesh.geometry.stability import Stability, stable_abscissa
 from duio_mesh.geometry.staircase import detectability_decomposition, observability_decomposition
 from duio_mesh.geometry.subspace import GeometryError, kernel, norm
 from duio_mesh.synthesis.sampled import Local
@@ -56,28 +56,77 @@ class Separated:
     B2: Array
     D1: Array
     margin: float
-    """Smallest singular value of C~ D relative to |C~| |D|; 0 violates Assumption 2."""
+    """Smallest singular value of C~ D relative to |C~| |D|; 0 violates Assumption 2.
+
+    In the file's units, or where it is too small there, with rows of C and columns of D of length 1.
+    """
 
 
 def separate(model: Model, who: str, unknown: Sequence[str]) -> Separated:
     """The output transform and Algorithm 1 of seed 004. ``who`` and ``unknown`` (names) are for error texts.
 
-    Raises DesignError when the noise channel has dependent columns, or when Assumption 2, rank(C~ D) = rank(D), fails.
+    Raises DesignError when the noise channel has dependent columns, or when Assumption 2, rank(C~ D) = rank(D), fails
+    in the units of the file and in those of ``_in_units`` alike.
     """
-    A, B, D, C, F = model
-    q = D.shape[1]
+    q, F = model.D.shape[1], model.F
     noise = np.linalg.svd(F, compute_uv=False)
     if F.shape[1] > F.shape[0] or (noise.size and noise[-1] * WORST_CONDITION <= noise[0]):
         raise DesignError(
             f"{who}: the noise channel ({F.shape[0]} x {F.shape[1]}) must have independent columns; "
             f"its singular values are {_list(noise)}"
         )
-    Q = kernel(F.T).T if F.shape[1] else np.eye(F.shape[0])  # orthonormal rows with Q F = 0
+    seen = _seen(model)
+    if seen.holds:
+        return _separated(model, seen)
+    scaled, y, f = _in_units(model)
+    seen = _seen(scaled)
+    if not seen.holds:
+        raise DesignError(_not_matched(who, unknown, seen.values, len(model.C), F.shape[1], q))
+    s = _separated(scaled, seen)
+    return replace(s, W1=s.W1 * y, W2=s.W2 * y, D1=s.D1 / f)
+
+
+def _in_units(model: Model) -> tuple[Model, Array, Array]:
+    """The model of diag(y) times the outputs and diag(1/f) times the unknown inputs, with y (p,) and f (q,).
+
+    Rows of C and columns of D have length 1 there, so whether C~ D has full rank does not depend on the file's units;
+    F is only read for its image, so its columns are brought to length 1 as well.
+    """
+    y, f = 1 / _lengths(model.C.T), 1 / _lengths(model.D)
+    F = y[:, None] * model.F
+    return model._replace(D=model.D * f, C=y[:, None] * model.C, F=F / _lengths(F)), y, f
+
+
+def _lengths(M: Array) -> Array:
+    """Lengths of the columns; 1 for a zero column."""
+    lengths: Array = np.linalg.norm(M, axis=0)
+    return np.where(lengths > 0, lengths, 1.0)
+
+
+class _Seen(NamedTuple):
+    """How the noise-free outputs Q y = C~ x see the unknown input."""
+
+    Q: Array  # (p - r, p) orthonormal rows with Q F = 0
+    U: Array  # left singular vectors of C~ D
+    values: Array  # singular values of C~ D relative to |C~| |D|
+    holds: bool  # Assumption 2
+
+
+def _seen(model: Model) -> _Seen:
+    F, q = model.F, model.D.shape[1]
+    Q = kernel(F.T).T if F.shape[1] else np.eye(F.shape[0])
+    Cb = Q @ model.C
+    U, values, _ = np.linalg.svd(Cb @ model.D)
+    size = norm(Cb) * norm(model.D)
+    holds = len(Cb) >= q and (not q or bool(values[-1] * WORST_CONDITION > size))
+    return _Seen(Q, U, values / (size or 1.0), holds)
+
+
+def _separated(model: Model, seen: _Seen) -> Separated:
+    """Algorithm 1 for a model that satisfies Assumption 2."""
+    A, B, D, C, _ = model
+    q, Q, U = D.shape[1], seen.Q, seen.U
     Cb = Q @ C
-    size = norm(Cb) * norm(D)
-    U, seen, _ = np.linalg.svd(Cb @ D)
-    if Cb.shape[0] < q or (q and seen[-1] * WORST_CONDITION <= size):
-        raise DesignError(_not_matched(who, unknown, seen / (size or 1.0), C.shape[0], F.shape[1], q))
     S1, S2 = U[:, :q].T, U[:, q:].T
     U1 = np.linalg.svd(D)[0][:, :q]
     V2 = kernel(S1 @ Cb) if q else np.eye(A.shape[0])
@@ -97,7 +146,7 @@ def separate(model: Model, who: str, unknown: Sequence[str]) -> Separated:
         B1=T1 @ B,
         B2=T2 @ B,
         D1=T1 @ D,
-        margin=float(seen[-1] / size) if q else 1.0,
+        margin=float(seen.values[-1]) if q else 1.0,
     )
 
 
@@ -105,13 +154,17 @@ def _not_matched(who: str, unknown: Sequence[str], seen: NDArray[np.floating], p
     rank = int(np.sum(seen * WORST_CONDITION > 1))
     return (
         f"{who}: Assumption 2 fails: rank(C~ D) = {rank}, but rank(D) = {q} unknown inputs ({', '.join(unknown)}). "
-        f"Its {p} measurements leave {p - r} without noise; the singular values of C~ D relative to |C~| |D| are "
-        f"{_list(seen)} and must exceed {1 / WORST_CONDITION:g}. Measure states that the unknown inputs drive directly."
+        f"Its {p} measurements leave {p - r} without noise; the singular values of C~ D relative to |C~| |D| (rows of C "
+        f"and columns of D of length 1) are {_list(seen)} and must exceed {1 / WORST_CONDITION:g}. Measure states that the unknown inputs drive directly."
     )
 
 
 def _list(values: NDArray[np.floating]) -> str:
     return "[" + ", ".join(f"{v:.3g}" for v in values) + "]"
+
+
+class RateError(DesignError):
+    """No reliable gain moves the visible modes of a node as far left as asked for."""
 
 
 class Split(NamedTuple):
@@ -129,18 +182,29 @@ def split(s: Separated, sigma: float, rate: float, who: str) -> Split:
     """Hand the modes of (A22, C22) with Re >= -sigma that w2 does not show to the network, move the visible past -rate.
 
     Unobservable modes left of -sigma stay where they are: only the observable quotient is assigned.
-    Raises DesignError when the subspaces or the gain cannot be computed reliably.
+    Raises RateError when the gain, DesignError when the subspaces cannot be computed reliably.
     """
     try:
-        parts = detectability_decomposition(s.C22, s.A22, stable_abscissa(-max(sigma, 1e-6)))
+        parts = detectability_decomposition(s.C22, s.A22, hidden_from(sigma))
         Td, Tu = parts.D, parts.U
         Ad, Cd = Td.T @ s.A22 @ Td, s.C22 @ Td
         visible = observability_decomposition(Cd, Ad).D
+    except GeometryError as e:
+        raise DesignError(f"{who}: observer.sigma = {sigma:g}: {e}") from None
+    try:
         Nd = -visible @ stabilise(Cd @ visible, visible.T @ Ad @ visible, stable_abscissa(-rate))
     except GeometryError as e:
-        raise DesignError(f"{who}: {e}") from None
+        raise RateError(
+            f"{who}: observer.rate = {rate:g}: its measurements see the visible modes too weakly for a reliable gain "
+            f"that moves them left of -{rate:g} 1/s; a smaller rate may do ({e})"
+        ) from None
     own = np.linalg.eigvals(Ad - Nd @ Cd).astype(np.complex128)
     return Split(Td, Tu, Tu.T @ s.A22 @ Tu, Td @ Nd, parts.eigenvalues, own)
+
+
+def hidden_from(sigma: float) -> Stability:
+    """The region left of -sigma; sigma = 0 keeps a distance from the axis, where rounding would decide."""
+    return stable_abscissa(-max(sigma, 1e-6))
 
 
 class Interval(NamedTuple):

@@ -10,11 +10,14 @@ from numpy.typing import NDArray
 
 from duio_mesh.arrays import Array
 from duio_mesh.errors import DesignError
-from duio_mesh.geometry.subspace import RTOL, image, rank, unit_columns, unit_rows
+from duio_mesh.geometry.subspace import RTOL, image, norm, rank, unit_columns, unit_rows
 from duio_mesh.scenario.model import Scenario
 
+HELD = 1e-9
+"""What may be left of an unknown input in a state, relative to the terms that cancel there."""
+
 ROUNDING = 1e-13
-"""A row of C or column of B̄ this much shorter than the longest is a rounding error, not a quantity in large units."""
+"""What rounding leaves where nothing has to cancel, relative to the whole projection and the whole column."""
 
 
 class Decoupling(NamedTuple):
@@ -42,14 +45,14 @@ def decouple(C: Array, Bbar: Array, node: str = "a node", unknown: Sequence[str]
     Source: seed 000, (6)-(10) with H_i = 0.
     """
     p, n = C.shape
-    columns = unit_columns(Bbar, ROUNDING)
+    columns = unit_columns(Bbar)
     basis = image(columns)
     r = basis.shape[1]
-    rows = unit_rows(C, ROUNDING)
+    rows = unit_rows(C)
     seen = np.linalg.svd(rows @ basis, compute_uv=False)
     if np.sum(seen > RTOL) < r:
         raise DesignError(_cannot_decouple(seen, p, r, node, unknown))
-    E = -basis @ np.linalg.pinv(C @ basis) if r else np.zeros((n, p))
+    E = _injection(C, rows, basis) if r else np.zeros((n, p))
     P = np.eye(n) + E @ C
     margins = {
         "output_rank": _least(rows.T, p),
@@ -60,12 +63,44 @@ def decouple(C: Array, Bbar: Array, node: str = "a node", unknown: Sequence[str]
     return Decoupling(E, P, basis, margins)
 
 
+def _injection(C: Array, rows: Array, basis: Array) -> Array:
+    """E = -B̄ (C B̄)^+, corrected where measurements in very different units cost it its digits: E C B̄ = -B̄."""
+    E: Array = -basis @ np.linalg.pinv(C @ basis)
+    left = basis + E @ (C @ basis)
+    if norm(left) > HELD**1.5:  # far above rounding, so an E without this trouble stays what it was
+        seen = C.any(axis=1)
+        lengths = np.sum(C[seen] * rows, axis=1)
+        E[:, seen] -= left @ np.linalg.pinv(rows @ basis) / lengths
+    return E
+
+
 def decouple_node(scenario: Scenario, i: int) -> Decoupling:
     """``decouple`` for node i of the scenario. Raises DesignError that names the node and its unknown inputs."""
+    found = decouple(scenario.nodes[i].C, scenario.unknown(i), f"node {i}", _unknown_names(scenario, i))
+    check_decoupled(found.P, scenario, i)
+    return found
+
+
+def check_decoupled(P: Array, scenario: Scenario, i: int) -> None:
+    """Test P b = 0 for every column b of an input that node i is not told, as the file gives it.
+
+    ``P`` (., n) is what the design of the node multiplies the plant by. The rank decisions behind it look at columns
+    and subspaces as a whole, so in bad units they may take an input for a multiple of another one. Here every state is
+    compared with the terms that cancel in it, which does not depend on units.
+    Raises DesignError that names the node, the input, the state and the cure.
+    """
+    for name, b in zip(_unknown_names(scenario, i), scenario.unknown(i).T, strict=True):
+        left, terms = np.abs(P @ b), np.abs(P) @ np.abs(b)
+        excess = left - HELD * terms - ROUNDING * max(norm(P), 1.0) * np.abs(b).max(initial=0.0)
+        if (excess > 0).any():
+            raise DesignError(_leaks(f"node {i}", name, b, left, terms, int(np.argmax(np.where(excess > 0, left, 0)))))
+
+
+def _unknown_names(scenario: Scenario, i: int) -> list[str]:
+    """Of the columns of scenario.unknown(i)."""
     told = set(scenario.nodes[i].knows)
     names = [name for name in scenario.plant.inputs if name not in told]
-    names += [f"disturbance {j}" for j in range(1, scenario.plant.E.shape[1] + 1)]
-    return decouple(scenario.nodes[i].C, scenario.unknown(i), f"node {i}", names)
+    return names + [f"disturbance {j}" for j in range(1, scenario.plant.E.shape[1] + 1)]
 
 
 def _least(M: Array, wanted: int) -> float:
@@ -73,6 +108,16 @@ def _least(M: Array, wanted: int) -> float:
     if wanted == 0:
         return 1.0
     return min(1.0, float(np.linalg.svd(M, compute_uv=False)[wanted - 1])) if min(M.shape) >= wanted else 0.0
+
+
+def _leaks(node: str, name: str, b: Array, left: Array, terms: Array, k: int) -> str:
+    sizes = np.abs(b[b != 0])
+    return (
+        f"{node}: it is not told {name}, but its observer cannot be decoupled from it in double precision: of terms of "
+        f"size {terms[k]:.2g}, {left[k]:.2g} is left in state x{k + 1}. The input's entries, {sizes.min():.2g} to "
+        f"{sizes.max():.2g} in size, hide one another beside the other inputs that it is not told. Choose units of the "
+        "states so that the entries of A and of every input's column have similar sizes, or let it know this input."
+    )
 
 
 def _cannot_decouple(seen: NDArray[np.floating[Any]], p: int, r: int, node: str, unknown: Sequence[str]) -> str:

@@ -209,5 +209,5 @@ def test_extremes() -> None:
     assert everything.Wg.shape == (2, 2)
     # a tiny input column counts as much as a large one: columns have units of their own
     small = unknown_input_structure(np.eye(2), A, np.array([[1e-8, 0.0], [0.0, 1e8]]), stable_radius())
-    assert small.W.shape == (2, 1)
+    assert small.W.shape == (2, 2)
     assert unknown_input_structure(np.eye(2), A, np.array([[1e-4, 0], [0, 1.0]]), stable_radius()).W.shape == (2, 2)

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from duio_mesh import load_scenario, synthesise
 from duio_mesh.errors import DesignError
 from duio_mesh.synthesis.uio import decouple
 
@@ -61,9 +64,65 @@ def test_without_unknown_inputs_nothing_is_changed(Bbar):
     assert found.basis.shape == (4, 0)
 
 
-def test_rounding_errors_are_not_an_unknown_input():
-    B = np.array([[1.0, 1e-17], [0.0, 3e-17], [0.0, -2e-17]])
-    assert decouple(np.eye(2, 3), B).basis.shape == (3, 1)
+@pytest.mark.parametrize("short", [1e-13, 1e-30, 1e-200])
+def test_the_length_of_a_column_is_only_its_unit(short):
+    B = np.array([[1.0, 1e-17], [0.0, 3e-17], [0.0, -2e-17]]) * [1.0, short]
+    found = decouple(np.eye(2, 3), B)
+    assert found.basis.shape == (3, 2)
+    np.testing.assert_allclose(found.P @ (B / np.abs(B).max(axis=0)), 0, atol=1e-14)
+
+
+def test_measurements_in_very_different_units_do_not_cost_digits():
+    _, C, B = random_pair(4, 6, 4, 2)
+    found = decouple(np.diag([1e-9, 1.0, 1e6, 1e-4]) @ C, B)
+    np.testing.assert_allclose(found.P @ B, 0, atol=1e-12 * np.linalg.norm(found.P))
+
+
+TWO = [[{"constant": {"value": 1.0}}]] * 2
+LARGE = {"time": "discrete", "period": 1, "A": [[0.5, 0], [0, 0.5]], "E": [[1e-5, 0], [0, 1e8]], "x0": [1, 1]}
+HIDING = {"A": [[0.5, 0, 0], [0, 0.5, 0], [0, 1e-5, 0.5]], "E": [[1e5, 1e5], [1e-5, 0], [0, 0]], "x0": [1, 1, 1]}
+HYDRAULIC = {
+    "time": "continuous",
+    "A": [[0, 1, 0], [-400, -6, 2e-5], [0, -1e9, -2]],
+    "B": [[0], [0], [1e12]],
+    "inputs": ["flow"],
+    "control": {"signals": {"flow": {"constant": {"value": 1e-6}}}},
+    "E": [[0], [0.02], [0]],
+    "disturbance": TWO[:1],
+    "x0": [0, 0, 0],
+}
+
+
+def designed(folder, plant, C, observer, **timing):
+    """The design of one node on its own."""
+    plant = plant if "disturbance" in plant else {"disturbance": TWO, **plant}
+    nodes, run = {"1": {"C": C}}, {"steps": 10, "convergence": {"rms_below": 1}, **timing}
+    document = {"name": "units", "plant": plant, "observer": observer, "nodes": nodes, "run": run}
+    document["graph"] = {"edges": []}
+    path = folder / "units.yaml"
+    path.write_text(json.dumps(document).replace('"1":', "1:"), "utf-8")
+    return synthesise(load_scenario(path))
+
+
+DISCRETE = [{"method": "lmi"}, {"method": "augmented"}, {"method": "admm", "fusion": "finite_time"}]
+
+
+@pytest.mark.parametrize("observer", DISCRETE)
+def test_an_input_in_large_units_does_not_hide_the_others(tmp_path, observer):
+    made = designed(tmp_path, LARGE, [[1, 0], [0, 1]], observer)
+    assert made.certificate["spectral_radius"] == pytest.approx(0, abs=1e-12)
+
+
+@pytest.mark.parametrize("observer", DISCRETE)
+def test_an_input_that_cannot_be_told_from_another_is_refused(tmp_path, observer):
+    words = r"node 1: it is not told disturbance 1.* state x2.*Choose units of the states"
+    with pytest.raises(DesignError, match=words):
+        designed(tmp_path, {**LARGE, **HIDING}, [[1, 0, 0], [0, 1, 0]], observer)
+
+
+def test_the_geometric_observer_keeps_a_force_beside_a_flow(tmp_path):
+    made = designed(tmp_path, HYDRAULIC, np.eye(3).tolist(), {"method": "geometric"}, step=0.001)
+    assert made.certificate["nodes"][1]["dim_W"] == 2
 
 
 def test_says_who_cannot_be_decoupled_from_what():
