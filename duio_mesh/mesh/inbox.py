@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import time
 from queue import SimpleQueue
-from typing import Any, TypeAlias
-
-import zenoh
+from typing import TypeAlias
 
 from duio_mesh.arrays import Array
 from duio_mesh.mesh.frames import Decoder
-from duio_mesh.mesh.session import Mesh, Ready, Source
+from duio_mesh.mesh.session import Mesh, Ready, Source, at_once
 
 At: TypeAlias = tuple[int, int]
 """(step, round)"""
@@ -30,8 +28,7 @@ class Link(Source):
         inbox.links.append(self)
         mesh.sources.append(self)
         put = inbox.put
-        callback: Any = zenoh.handlers.Callback(lambda sample: put(self, sample.payload.to_bytes()), indirect=False)
-        mesh.subscribe(key, callback, ready)
+        mesh.subscribe(key, at_once(lambda sample: put(self, sample.payload.to_bytes())), ready)
 
     @property
     def newest(self) -> At:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import threading
 from collections.abc import Callable, Iterator
 from functools import partial
 from queue import Empty, SimpleQueue
@@ -13,7 +12,7 @@ from typing import Any, NamedTuple, Self
 import zenoh
 
 from duio_mesh.errors import RunError
-from duio_mesh.mesh.session import CLOSE
+from duio_mesh.mesh.session import at_once, close
 from duio_mesh.spec import START, Outside
 
 QUEUE = 200_000  # messages that may wait; further ones are counted and dropped
@@ -73,9 +72,7 @@ class OutsideWorld:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
-        closing = threading.Thread(target=self._session.close, daemon=True)
-        closing.start()
-        closing.join(CLOSE)
+        close(self._session, self._warn)
 
     def get(self, timeout: float) -> Heard | None:
         """The next message, None when there is none within ``timeout`` seconds."""
@@ -90,7 +87,7 @@ class OutsideWorld:
             yield self._queue.get()  # nobody else takes from it
 
     def _subscribe(self, key: str, callback: Callable[[Any], None]) -> Any:
-        return self._session.declare_subscriber(key, zenoh.handlers.Callback(callback, indirect=False))
+        return self._session.declare_subscriber(key, at_once(callback))
 
     def _take(self, key: str, sample: Any) -> None:
         """On a thread of Zenoh's: only copies."""

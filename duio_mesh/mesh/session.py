@@ -64,9 +64,18 @@ def configured(wire: Wire) -> zenoh.Config:
     return config
 
 
-def _at_once(callback: Callable[[Any], None]) -> Any:
+def at_once(callback: Callable[[Any], None]) -> Any:
     """Call back on Zenoh's own thread. The plain form would start a thread of its own for every subscriber."""
     return zenoh.handlers.Callback(callback, indirect=False)
+
+
+def close(session: zenoh.Session, warn: Callable[[str], None]) -> None:
+    """End a session in order; after ``CLOSE`` seconds leave without it: a frozen peer would hold that up for ever."""
+    closing = threading.Thread(target=session.close, daemon=True)
+    closing.start()
+    closing.join(CLOSE)
+    if closing.is_alive():
+        warn(f"left without an orderly end: a peer did not take what was queued for it within {CLOSE:g} s")
 
 
 def _matched(news: SimpleQueue[str], name: str, status: Any) -> None:
@@ -164,15 +173,8 @@ class Mesh:
         self.close()
 
     def close(self) -> None:
-        """End the session, which sends what is still queued.
-
-        A frozen peer would hold that up for ever; after ``CLOSE`` seconds we leave without it.
-        """
-        closing = threading.Thread(target=self._session.close, daemon=True)
-        closing.start()
-        closing.join(CLOSE)
-        if closing.is_alive():
-            self._warn(f"left without an orderly end: a peer did not take what was queued for it within {CLOSE:g} s")
+        """End the session, which sends what is still queued."""
+        close(self._session, self._warn)
 
     # -- declaring --------------------------------------------------------------------------------------------------
 
@@ -184,7 +186,7 @@ class Mesh:
         source = Source(name, who, Decoder(self.keys.run, who))
         self.sources.append(source)
         put = self._queue.put
-        self.subscribe(key, _at_once(lambda sample: put((source, sample.payload.to_bytes()))), ready)
+        self.subscribe(key, at_once(lambda sample: put((source, sample.payload.to_bytes()))), ready)
         return source
 
     def subscribe(self, key: str, handler: Any, ready: Ready | None) -> Any:
@@ -242,7 +244,7 @@ class Mesh:
             tell(member, alive)
 
         everyone = self.keys.alive("**")
-        self._kept.append(self._session.liveliness().declare_subscriber(everyone, _at_once(seen), history=True))
+        self._kept.append(self._session.liveliness().declare_subscriber(everyone, at_once(seen), history=True))
 
     def alive(self, member: Member) -> bool:
         """Whether a directly linked process has announced itself and not gone since."""
@@ -277,7 +279,7 @@ class Mesh:
         matched: set[str] = set()
         news = SimpleQueue[str]()
         for name, publisher in meeting.items():
-            self._kept.append(publisher.declare_matching_listener(_at_once(partial(_matched, news, name))))
+            self._kept.append(publisher.declare_matching_listener(at_once(partial(_matched, news, name))))
             if publisher.matching_status.matching:
                 news.put(name)
         end = time.monotonic() + timeout

@@ -89,7 +89,7 @@ def main(argv: Sequence[str]) -> int:
 def find(folder: Path, node: int) -> tuple[NodeSpec, Path]:
     """The node's spec and where its tape is.
 
-    Raises ScenarioError naming what is missing and what to do about it, ValueError when the spec is damaged, OSError.
+    Raises ReplayError naming what is missing and what to do about it, ValueError when the spec is damaged, OSError.
     """
     if not (folder / "nodes").is_dir():
         raise ReplayError(f"{folder} is not the folder of a run: it has no nodes/")
