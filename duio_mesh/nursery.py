@@ -148,7 +148,7 @@ class Nursery:
                 os.dup2(errors, 1)
                 os.dup2(errors, 2)
                 kind, run = KINDS[order["start"]]
-                report = Report(order["who"], self._status, Path(order["log"]))
+                report = Report(order["who"], self._status, Path(order["log"]), watched=True)
                 code = live(kind, run, Path(order["spec"]), report)
         except BaseException:
             traceback.print_exc()  # into its .err file, once that is open

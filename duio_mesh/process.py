@@ -32,8 +32,9 @@ class Stop(BaseException):
 class Report:
     """Says what happens in a process, one JSON line an event."""
 
-    def __init__(self, who: str, fd: int, log: Path | None = None) -> None:
-        self._who, self._fd = who, fd
+    def __init__(self, who: str, fd: int, log: Path | None = None, *, watched: bool = False) -> None:
+        """``fd``: where events go; ``log``: a file for them beside; ``watched``: a launcher wants signs of life."""
+        self._who, self._fd, self._watched = who, fd, watched
         self._log = log.open("a") if log else None
 
     def __call__(self, event: str, **fields: Any) -> None:
@@ -48,8 +49,8 @@ class Report:
             os.write(self._fd, json.dumps({"who": self._who, **event}).encode() + b"\n")
 
     def beat(self) -> None:
-        """Show the launcher that things move, though no step may be finished for long. Not an event, not logged."""
-        if self._log:
+        """Show a launcher that things move, though no step may be finished for long. Not an event, not logged."""
+        if self._watched:
             self._say({"event": "beat"})
 
     def warn(self, text: str) -> None:
