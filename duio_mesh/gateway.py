@@ -12,11 +12,12 @@ from collections import Counter
 import numpy as np
 
 from duio_mesh.arrays import Array
+from duio_mesh.credits import Credits
 from duio_mesh.errors import RunError
 from duio_mesh.journal import Journal
 from duio_mesh.mesh import Heard, Mesh, OutsideWorld
 from duio_mesh.mesh.rejoin import admit
-from duio_mesh.plant import RECORDER, Credits
+from duio_mesh.plant import RECORDER
 from duio_mesh.process import Report, main
 from duio_mesh.sensors.messages import ROS, Refused, read
 from duio_mesh.sensors.steps import Steps

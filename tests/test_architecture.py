@@ -33,7 +33,7 @@ FLOORS = [
         "tape",
     ],
     ["report", "process"],
-    ["links"],
+    ["links", "credits"],
     ["synthesis", "simulation", "node", "plant", "gateway", "recorder", "router", "health"],
     ["nursery", "diagnosis", "account", "supervisor", "run_folder", "schema", "credentials", "wiring", "limits"],
     ["recovery"],
