@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import os
 import signal
 import sys
 from collections.abc import Iterator, Sequence
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from duio_mesh.supervisor import Supervisor
     from duio_mesh.synthesis.design import Design
 
+FEW = 8  # warnings that are shown when a run fails
 CONVERGED, NOT_CONVERGED, IMPOSSIBLE, FAILED, INTERRUPTED = 0, 1, 2, 3, 130
 
 EPILOG = """\
@@ -80,34 +82,47 @@ def parser() -> argparse.ArgumentParser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; the exit code."""
     argv = sys.argv[1:] if argv is None else argv
-    if argv and argv[0] in ("export", "gather"):
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, _interrupt)
+    try:
+        return _command(argv)
+    except (ScenarioError, DesignError) as e:
+        print(e, file=sys.stderr)
+        return IMPOSSIBLE
+    except (RunError, OSError) as e:  # OSError: a full disk, a folder that may not be written
+        said = getattr(e, "warnings", ())
+        for warning in said[:FEW]:
+            print(f"warning: {warning}", file=sys.stderr)
+        if len(said) > FEW:
+            print(f"and {len(said) - FEW} further warnings (logs/)", file=sys.stderr)
+        print(f"run failed: {e}", file=sys.stderr)
+        return FAILED
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        return INTERRUPTED
+
+
+def _command(argv: Sequence[str]) -> int:
+    """Carry out the command that the arguments ask for."""
+    command = argv[0] if argv else ""
+    if command in ("export", "gather"):
         from duio_mesh.deploy import command as deploy
 
         return deploy.main(argv)
-    if list(argv[:1]) == ["new"]:
-        from duio_mesh.generate import command
+    if command == "new":
+        from duio_mesh.generate import command as generate
 
-        return command.main(argv[1:])
-    if list(argv[:1]) == ["replay"]:
+        return generate.main(argv[1:])
+    if command == "replay":
         from duio_mesh import replay
 
         return replay.main(argv[1:])
     args = parser().parse_args(argv)
     if args.contingency is not None and not args.check:
         parser().error("--contingency says what a design is worth on other graphs: use it with --check")
-    for number in (signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, _interrupt)
-    try:
-        return _main(args)
-    except (ScenarioError, DesignError) as e:
-        print(e, file=sys.stderr)
-        return IMPOSSIBLE
-    except (RunError, OSError) as e:  # OSError: a full disk, a folder that may not be written
-        print(f"run failed: {e}", file=sys.stderr)
-        return FAILED
-    except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
-        return INTERRUPTED
+    if args.live and (args.no_record or args.in_process or args.check or args.dry_run):
+        parser().error("--live shows what the recorder process of a run records: use it without the others")
+    return _main(args)
 
 
 def _interrupt(*_: object) -> NoReturn:
@@ -125,8 +140,8 @@ def _main(args: argparse.Namespace) -> int:
         raise ScenarioError(
             ["--in-process: the measurements of this file come from outside (external:), which only processes can hear"]
         )
-    if args.out and args.out.exists() and (not args.out.is_dir() or any(args.out.iterdir())):
-        raise ScenarioError([f"--out {args.out}: already exists and is not empty; a run is never overwritten"])
+    if args.out:
+        _check_out(args.out)
 
     from duio_mesh import console
     from duio_mesh.synthesis.contingency import with_contingency
@@ -150,6 +165,17 @@ def _main(args: argparse.Namespace) -> int:
         result = _run(design, args, supervisor)
     console.result(design, result, live=args.live)
     return CONVERGED if result.converged else NOT_CONVERGED
+
+
+def _check_out(out: Path) -> None:
+    """Before a design that may take long. Raises ScenarioError where nothing can be written."""
+    if out.exists() and not out.is_dir():
+        raise ScenarioError([f"--out {out}: is not a folder"])
+    if out.exists() and any(out.iterdir()):
+        raise ScenarioError([f"--out {out}: already exists and is not empty; a run is never overwritten"])
+    there = next(path for path in (out, *out.absolute().parents) if path.exists())
+    if not there.is_dir() or not os.access(there, os.W_OK | os.X_OK):
+        raise ScenarioError([f"--out {out}: nothing can be written in {there}"])
 
 
 @contextlib.contextmanager

@@ -87,7 +87,7 @@ class Credits:
             except Empty:
                 who = [self._sources[i].who for i in late]
                 if time.monotonic() - heard > self._deadline:
-                    words = ", ".join(f"node-{i} (at step {self._done[i]})" for i in late)
+                    words = ", ".join(f"node-{i} (last heard of at step {self._done[i]})" for i in late)
                     raise RunError(
                         f"the plant waited {self._deadline:g} s for {words} to finish step {steps - 1}"
                     ) from None

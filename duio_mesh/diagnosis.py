@@ -10,6 +10,9 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
 
+from duio_mesh.errors import STOPPED
+
+SOURCES = ("plant", "gateway")
 FEW = 6  # waits that a message names
 STATES = {"T": "stopped", "t": "stopped by a debugger", "D": "waiting for a disk"}  # of /proc/<pid>/stat
 
@@ -25,6 +28,7 @@ class Process:
         self.lost: Sequence[str] = ()  # ... and whose end was the cause
         self.code: int | None = None  # exit code; negative is a signal
         self.warnings: list[str] = []
+        self.rejected: dict[str, int] = {}  # frames that it refused, by cause, as it says at its end
         self.pid = 0
         self.heard = 0.0  # when it, or the nursery about it, last said anything
         self.waits: dict[str, Any] = {}  # what it says that it waits for, when that takes long ...
@@ -59,6 +63,7 @@ class Process:
             self.back = True
         elif what == "exit":
             self.code, self.waits = event["code"], {}
+        self.rejected = event.get("rejected", self.rejected)
 
     @property
     def essential(self) -> bool:
@@ -69,6 +74,8 @@ class Process:
         """How it ended, in words."""
         if self.code is not None and self.code < 0:
             return f"{self.who} was killed by {signal.Signals(-self.code).name}"
+        if self.code == STOPPED:
+            return f"{self.who} was asked to stop, by somebody else's SIGTERM"
         return self.failure or f"{self.who} ended with exit code {self.code}"
 
     def waiting(self) -> str:
@@ -160,8 +167,8 @@ def owing(processes: Processes) -> list[Process]:
 
 def first_cause(processes: Processes) -> str:
     """Who was the first cause: a killed process before one that failed by itself, before one that lost a peer."""
-    there = essential(processes)
-    killed = [p.death() for p in there if p.code and p.code < 0]
+    there = sorted(essential(processes), key=lambda p: p.who in SOURCES)  # they wait for all, and know least
+    killed = [p.death() for p in there if p.code and (p.code < 0 or p.code == STOPPED)]
     failed = [p.failure for p in there if p.failure]
     first = [p.failure for p in there if p.failure and not p.lost]
     then = [text for text in failed if text not in first]

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+STOPPED = 143  # exit code of a process that was asked to stop by SIGTERM
+
 
 class DuioError(Exception):
     """Anything that duio_mesh itself refuses or reports; the text is meant for the user."""
@@ -24,9 +26,9 @@ class DesignError(DuioError):
 class RunError(DuioError):
     """A run that started has failed (exit 3): the message names the process, or the edge, step and round.
 
-    ``lost``: processes whose own end was the cause, and may say more.
+    ``lost``: processes whose own end was the cause, and may say more. ``warnings``: what went wrong before.
     """
 
-    def __init__(self, text: str, lost: Sequence[str] = ()) -> None:
+    def __init__(self, text: str, lost: Sequence[str] = (), warnings: Sequence[str] = ()) -> None:
         super().__init__(text)
-        self.lost = tuple(lost)
+        self.lost, self.warnings = tuple(lost), tuple(warnings)

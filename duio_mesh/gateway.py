@@ -49,6 +49,7 @@ def run(spec: PlantSpec, report: Report) -> None:
             report.warn(f"the recorder was not there after {RECORDER:g} s; starting without it")
         report("ready")
         credits, inlet = Credits(mesh, nodes, spec, report), Inlet(spec, outside, world, report)
+        report.last = lambda: {"rejected": mesh.rejections() | inlet.rejections()}
         size = sum(outside.widths().values())
         done, rows = 0, dict[int, Array]()
         begin, cpu = time.monotonic(), time.process_time()

@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import contextlib
 import json
+import signal
+import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol, TypeAlias
@@ -29,7 +31,7 @@ from duio_mesh.report.timeliness import timeliness, untimely
 from duio_mesh.report.trace_file import write_trace
 from duio_mesh.run_folder import RunFolder
 from duio_mesh.scenario.model import Scenario
-from duio_mesh.simulation import Trace, estimate_sizes, reconstructs, simulate
+from duio_mesh.simulation import Tally, Trace, estimate_sizes, reconstructs, simulate
 from duio_mesh.spec import AnySpec, NodeSpec, RecorderSpec, Wire, write_spec
 from duio_mesh.supervisor import Supervisor
 from duio_mesh.synthesis.design import Design
@@ -187,7 +189,8 @@ class Launch:
             x = _row(self._folder.rows("plant"), n, k - 1)
             estimate = _row(files[i], self._sizes[i], k - 1)
             if x is not None and estimate is not None:
-                errors[i] = float(np.sqrt(np.mean((estimate[:n] - x) ** 2)))
+                with np.errstate(over="ignore", invalid="ignore"):  # of an unstable plant
+                    errors[i] = float(np.sqrt(np.mean((estimate[:n] - x) ** 2)))
         show(Progress(self._finished(steps), errors, self._supervisor.note or self._supervisor.waiting(BRIEF)))
         return sum(sizes.values())
 
@@ -237,14 +240,31 @@ def run(
             failed = "interrupted"
             raise
         finally:
-            with contextlib.suppress(RunError):  # a nursery that died has taken everybody along
-                supervisor.end()
-            if not scenario.security.keep:
-                credentials.remove(folder.keys)
-            result = gather(folder, design, supervisor, time.monotonic() - begin, failed)
+            with _undisturbed():
+                with contextlib.suppress(RunError):  # a nursery that died has taken everybody along
+                    supervisor.end()
+                if not scenario.security.keep:
+                    credentials.remove(folder.keys)
+                result = gather(folder, design, supervisor, time.monotonic() - begin, failed)
     if failed:
-        raise RunError(f"{failed} (what there is of the run is in {folder.root})")
+        raise RunError(f"{failed} (what there is of the run is in {folder.root})", warnings=result.warnings)
     return result
+
+
+@contextlib.contextmanager
+def _undisturbed() -> Iterator[None]:
+    """Whoever presses Ctrl-C twice gets the results of what there is all the same."""
+    if threading.current_thread() is not threading.main_thread():  # which alone hears signals
+        yield
+        return
+    before = {
+        number: signal.signal(number, signal.SIG_IGN) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    }
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def run_in_process(
@@ -254,10 +274,23 @@ def run_in_process(
     folder = RunFolder.create(design.scenario.name, out)
     write_inputs(folder, design)
     begin = time.monotonic()
-    trace = simulate(design, lambda steps: show(Progress(steps, {})))
+    tally = Tally()
+    try:
+        trace = simulate(design, lambda steps: show(Progress(steps, {})), tally)
+    except BaseException:  # interrupted, for one: then there is nothing to keep
+        folder.tidy()
+        raise
     took = time.monotonic() - begin
-    rounds = len(trace.t)
-    counts: dict[str, Any] = {"rounds": rounds, "rounds_per_second": rounds / took}
+    counts: dict[str, Any] = {
+        "rounds": tally.rounds,
+        "rounds_per_second": tally.rounds / took,
+        "messages": tally.messages,
+        "rejected": {},
+        "events": [],
+        "failure": "",
+    }
+    if design.scenario.patchy:
+        counts["faults"] = {what: tally.faults[what] for what in COUNTED}
     warnings = _flagged(trace)
     if design.scenario.run.inputs:
         warnings += ("run.inputs: a run in one process keeps no tapes; only node processes do",)
@@ -299,7 +332,7 @@ def gather(folder: RunFolder, design: Design, account: Account, seconds: float, 
         "rounds": rounds,
         "rounds_per_second": rounds / took if took else 0.0,
         "messages": sum(node["frames"] for node in nodes),
-        "rejected": {who: done["rejected"] for who, done in said.items() if done.get("rejected")},
+        "rejected": {who: p.rejected for who, p in account.processes.items() if p.rejected},
         "events": account.events,
         "failure": failed,
     }

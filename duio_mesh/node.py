@@ -34,6 +34,7 @@ BEATS = 5  # signs of life inside a step per deadline
 def run(spec: NodeSpec, report: Report) -> None:
     """Run one node for ``spec.steps`` steps. Raises RunError when a neighbour or the plant is lost or late."""
     with Tape(spec) as tape, Mesh(spec.wire, f"node-{spec.id}", report.warn, spec.incarnation) as mesh:
+        report.last = lambda: {"rejected": mesh.rejections()}
         links = Links(spec, mesh, tape, report)
         mesh.watch(links.lockstep.noticed)
         with links.gaps, links.lockstep:

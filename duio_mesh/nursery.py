@@ -183,7 +183,8 @@ class Nursery:
             os.waitpid(pid, 0)
 
 
-if __name__ == "__main__":
+def main() -> None:
+    """Serve the launcher, whose socket and pipe are the two arguments."""
     setproctitle.setproctitle("duio-nursery")
     gc.freeze()  # what is here now is shared by all children; do not let their collectors touch (and copy) it
     Nursery(socket.socket(fileno=int(sys.argv[1])), int(sys.argv[2])).serve()

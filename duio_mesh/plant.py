@@ -7,12 +7,14 @@ The truth goes to the plant's own file and to the recorder, never to a node.
 from __future__ import annotations
 
 import time
+from math import isfinite
 
 import numpy as np
 
 from duio_mesh.arrays import Array
 from duio_mesh.credits import Credits
 from duio_mesh.dynamics import Plant
+from duio_mesh.errors import RunError
 from duio_mesh.journal import Journal
 from duio_mesh.mesh import Mesh
 from duio_mesh.mesh.pace import Pace
@@ -27,6 +29,7 @@ def run(spec: PlantSpec, report: Report) -> None:
     """Run the plant for ``spec.steps`` steps. Raises RunError when a node is lost or does not keep up."""
     plant = Plant(spec)
     with Mesh(spec.wire, "plant", report.warn) as mesh:
+        report.last = lambda: {"rejected": mesh.rejections()}
         keys, ids = mesh.keys, [s.id for s in spec.sensors]
         nodes = {i: mesh.hear(keys.credit(i), f"{i} -> plant", f"node-{i}") for i in ids}
         samples = {i: mesh.speak([(keys.plant(i), f"plant -> {i}", ("plant", i))]) for i in ids}
@@ -42,7 +45,7 @@ def run(spec: PlantSpec, report: Report) -> None:
         report("ready")
         credits, begin, cpu = Credits(mesh, nodes, spec, report), time.monotonic(), time.process_time()
         pace = Pace(spec, credits)
-        rows: dict[int, list[Array]] = {}
+        rows, zeros = dict[int, list[Array]](), np.zeros_like(plant.x)
         returns = [after for spans in spec.absent.values() for _, after in spans]
         with Journal(spec.output, plant.x.size, truth) as journal:
             for block in blocks(0, spec.steps, spec.block, returns):
@@ -57,6 +60,8 @@ def run(spec: PlantSpec, report: Report) -> None:
                         rows[i].append(data)
                     journal.add((plant.x,))
                     plant.advance()
+                    if not isfinite(zeros.dot(plant.x)):
+                        raise RunError(f"the plant's state overflowed at step {plant.k}; is the plant unstable?")
                 for i, outlet in samples.items():
                     outlet.send(block.start, 0, np.array(rows[i]))
             journal.flush()

@@ -19,10 +19,10 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, NoReturn
 
-from duio_mesh.errors import DuioError
+from duio_mesh.errors import STOPPED, DuioError
 from duio_mesh.spec import Spec, read_spec
 
-FAILED, STOPPED = 3, 143
+FAILED = 3
 
 
 class Stop(BaseException):
@@ -36,6 +36,8 @@ class Report:
         """``fd``: where events go; ``log``: a file for them beside; ``watched``: a launcher wants signs of life."""
         self._who, self._fd, self._watched = who, fd, watched
         self._log = log.open("a") if log else None
+        self.last: Callable[[], dict[str, Any]] = dict
+        """What a process that fails, or is stopped, has to say besides."""
 
     def __call__(self, event: str, **fields: Any) -> None:
         """Report ``event``; a launcher that is gone is not an error here (the process is about to be ended)."""
@@ -71,13 +73,14 @@ def live(kind: type[Spec], run: Callable[[Spec, Report], None], path: Path, repo
     try:
         run(read_spec(path, kind), report)
     except Stop:
-        report("stopped")
+        report("stopped", **report.last())
         return STOPPED
     except (DuioError, ValueError, OSError) as e:
-        report("failed", text=str(e), lost=getattr(e, "lost", ()))
+        report("failed", text=str(e), lost=getattr(e, "lost", ()), **report.last())
         return FAILED
     except Exception as e:
-        report("failed", text=f"{type(e).__name__}: {e}", traceback=traceback.format_exc()[-2000:])
+        trace = traceback.format_exc()[-2000:]
+        report("failed", text=f"{type(e).__name__}: {e}", traceback=trace, **report.last())
         return FAILED
     return 0
 

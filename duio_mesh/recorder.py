@@ -55,6 +55,7 @@ def run(spec: RecorderSpec, report: Report) -> None:
             mesh.wake()
 
         signal.signal(signal.SIGTERM, finish)
+        report.last = lambda: {"rejected": mesh.rejections()}
         keys = mesh.keys
         node_of: dict[Source, int | None] = {}
         for i in spec.sizes:

@@ -25,7 +25,9 @@ class Recovery:
             return False
         supervisor, who = self._supervisor, lost.who
         if self._policy == "degrade" and not all(p.said for p in supervisor.processes.values() if p.essential):
-            return False  # a run begins with everybody: the others would look for it until the start's time is over
+            # the others would look for it until the start's time is over
+            lost.warnings.append("it was lost before everybody was there, and a run begins with everybody")
+            return False
         supervisor.remember("death", who=who, text=lost.death())
         if self._policy == "degrade" or supervisor.source_done():
             lost.there = False

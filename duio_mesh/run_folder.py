@@ -41,8 +41,7 @@ class RunFolder:
         """
         if out is not None:
             root = Path(out)
-            if root.exists() and (not root.is_dir() or any(root.iterdir())):
-                raise RunError(f"{root} already exists and is not an empty folder; choose another --out")
+            check_free(root)
             root.mkdir(parents=True, exist_ok=True)
         else:
             home = Path("runs") / name
@@ -101,6 +100,12 @@ class RunFolder:
         for path in (self.root / "logs").glob("*.err"):
             if path.stat().st_size == 0:
                 path.unlink()
+
+
+def check_free(root: Path) -> None:
+    """Raise RunError when there is something already: a run is never overwritten."""
+    if root.exists() and (not root.is_dir() or any(root.iterdir())):
+        raise RunError(f"{root} already exists and is not an empty folder; choose another --out")
 
 
 def _unused(path: Path) -> Path:

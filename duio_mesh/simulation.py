@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -20,11 +21,23 @@ from duio_mesh.synthesis.design import Design
 from duio_mesh.trace import Trace as Trace  # re-exported: it lives lower, where report/ may import it
 
 
-def simulate(design: Design, progress: Callable[[int], None] = lambda _: None) -> Trace:
+@dataclass
+class Tally:
+    """What processes would have counted."""
+
+    rounds: int = 0  # exchanges of the node that has most of them
+    messages: int = 0  # frames between nodes
+    faults: Counter[str] = field(default_factory=Counter)  # frames by what the fault model did to them
+
+
+def simulate(design: Design, progress: Callable[[int], None] = lambda _: None, tally: Tally | None = None) -> Trace:
     """Run plant and observers in lockstep; ``progress`` is called with the number of finished steps.
+
+    ``tally`` is filled in.
 
     Raises RunError at a step in which a node is killed on purpose and ``run.on_node_loss`` is stop.
     """
+    tally = Tally() if tally is None else tally
     plant = Plant(design.plant)
     nodes = {i: _Node(spec) for i, spec in design.nodes.items()}
     truth = list[Array]()
@@ -43,6 +56,8 @@ def simulate(design: Design, progress: Callable[[int], None] = lambda _: None) -
             plant.advance()
         before = data
         rounds = {i: node.observer.rounds for i, node in present.items()}  # islands may need different numbers of them
+        tally.rounds += max(rounds.values(), default=0)
+        tally.messages += sum(count * len(design.nodes[i].tells) for i, count in rounds.items())
         for r in range(max(rounds.values(), default=0)):
             turn = {i: node for i, node in present.items() if r < rounds[i]}
             sent = {i: node.observer.message(r).copy() for i, node in turn.items()}
@@ -53,6 +68,9 @@ def simulate(design: Design, progress: Callable[[int], None] = lambda _: None) -
         for node in nodes.values():
             node.write(done - k)
         progress(done)
+    for node in nodes.values():
+        tally.faults.update(node.network.counts)
+    tally.messages += tally.faults["duplicate"]
     return split_trace(
         design,
         np.array(truth),
@@ -124,6 +142,11 @@ class _InEdges:
         planned = spec.faults.rules or spec.faults.absent
         self._reception = Reception(spec.faults, spec.hears) if planned else None
         self._held: dict[Stamp, Array] = {}
+
+    @property
+    def counts(self) -> Mapping[str, int]:
+        """Frames by what the model did to them."""
+        return {} if self._reception is None else self._reception.counts
 
     def next(self, k: int, r: int, sent: Mapping[int, Array]) -> tuple[dict[int, Array], list[Late]]:
         """The vectors of step k, round r that arrive in this very exchange, and older ones that arrive now."""

@@ -31,6 +31,9 @@ MARGIN = 2.0  # seconds beyond the deadline that a process has for saying itself
 GATHER = 0.3  # seconds after the first failure in which others may say what they saw
 END = 2.0  # seconds for asked processes to end before they are made to
 LONGER = PATIENCE + 1  # deadlines, where lost nodes are survived: their own waits may last PATIENCE of them
+HERE = str(Path(__file__).parent.parent)
+# -P: nothing in the present folder is imported; this package is found where it is, installed or not
+NURSERY = "import sys; sys.path.append(sys.argv.pop()); from duio_mesh.nursery import main; main()"
 THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
 Recover: TypeAlias = Callable[[Process], bool] | None
@@ -46,7 +49,7 @@ class Supervisor(Account):
         self._control, theirs = socket.socketpair()
         environment = os.environ | dict.fromkeys(THREADS, "1")
         self._nursery = subprocess.Popen(  # noqa: S603  (our own interpreter and module)
-            [sys.executable, "-m", "duio_mesh.nursery", str(theirs.fileno()), str(write)],
+            [sys.executable, "-P", "-c", NURSERY, str(theirs.fileno()), str(write), HERE],
             pass_fds=(theirs.fileno(), write),
             stdin=subprocess.DEVNULL,
             start_new_session=True,  # a Ctrl-C in the terminal is the launcher's alone
@@ -182,8 +185,8 @@ class Supervisor(Account):
         """Ask all processes to stop, then make them."""
         for number in (signal.SIGTERM, signal.SIGKILL):
             for p in self.processes.values():
-                if p.code is None:
-                    self.kill(p.who, number)
+                if p.code is None:  # a recorder that has not begun has nothing to finish, and looks for the others
+                    self.kill(p.who, number if p.said or p.essential else signal.SIGKILL)
             self._until(lambda: all(p.code is not None for p in self.processes.values()), END)
 
     def _stuck(self, still: float, deadline: float, times: int) -> bool:
@@ -220,7 +223,10 @@ class Supervisor(Account):
                 self._read(self._status)
 
     def _read(self, fd: int) -> None:
-        data = os.read(fd, 1 << 16)
+        try:
+            data = os.read(fd, 1 << 16)
+        except ConnectionResetError:  # it was killed before it had read what we told it
+            data = b""
         if not data and fd == self._control.fileno():
             raise RunError("the nursery process, which starts and watches the others, has died")
         if not data:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,31 +16,37 @@ from duio_mesh.deploy.stored import read_design, write_design
 from duio_mesh.errors import RunError, ScenarioError
 from duio_mesh.journal import aside, map_rows, missing
 from duio_mesh.launcher import RunResult
-from duio_mesh.run_folder import RunFolder
+from duio_mesh.run_folder import RunFolder, check_free
 from duio_mesh.simulation import estimate_sizes
 from duio_mesh.synthesis.design import Design
 
 BESIDE = (lambda path: path, aside, missing)
 
 
-def gather(root: Path, sources: Iterable[Path], out: Path | None) -> tuple[Design, RunResult]:
+def gather(root: Path, sources: Sequence[Path], out: Path | None) -> tuple[Design, RunResult]:
     """The results of the run whose design is in ``root``, from all journals and logs below ``sources``.
 
     They are written to ``out``, by default into ``root`` itself. A process' own journal and what the recorder wrote
     down of it may both be there: the longer one counts, and they must not contradict each other. Raises ScenarioError
-    when there is no design or there are results already, RunError when there is nothing to gather, when two
-    journals contradict each other, or when a process failed (the results are then written all the same).
+    when there is no design, no such folder, or there are results already, RunError when there is nothing to gather,
+    when two journals contradict each other, or when a process failed (the results are then written all the same).
     """
     design = read_design(root)
     if out is not None:
-        root = write_design(design, out)
+        check_free(out)
     elif (root / "trace.npz").exists():
         raise ScenarioError([f"{root} holds results already; say where these shall go: --out DIR"])
+    if nowhere := [str(source) for source in sources if not source.is_dir()]:
+        raise ScenarioError([f"{', '.join(nowhere)}: no such folder"])
+    found = [path for source in sources for path in sorted(source.rglob("*")) if path.is_file()]
+    sizes = {"plant": design.scenario.plant.n} | {f"node-{i}": size for i, size in estimate_sizes(design).items()}
+    if not any(path.name == f"{who}.f64" for path in found for who in sizes):
+        raise RunError(f"nothing to gather: no journal (plant.f64, node-*.f64) below {', '.join(map(str, sources))}")
+    if out is not None:
+        root = write_design(design, out)
     folder = RunFolder(root.resolve())
     folder.rows("plant").parent.mkdir(exist_ok=True)
     logs = Logs()
-    found = [path for source in sources for path in sorted(source.rglob("*")) if path.is_file()]
-    sizes = {"plant": design.scenario.plant.n} | {f"node-{i}": size for i, size in estimate_sizes(design).items()}
     shortfall = []
     for who, size in sizes.items():
         rows = _rows(who, size, [path for path in found if path.name == f"{who}.f64"], folder)
