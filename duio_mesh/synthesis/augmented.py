@@ -72,7 +72,8 @@ def design(scenario: Scenario, progress: Progress) -> Design:
             f"{LARGEST} on a design takes hours. method: lmi (coupling gains by products with blocks) and "
             "method: admm handle thousands; or use fewer nodes"
         )
-    gains = find_gains(scenario, network, options, progress)
+    found = find_gains(scenario, network, options, progress)
+    gains = found.gains
     progress(f"certificate: eigenvalues, powers and distance to instability of {rows} rows")
     figures = _figures(network, gains)
     _refuse(figures, options)
@@ -83,9 +84,11 @@ def design(scenario: Scenario, progress: Progress) -> Design:
         "peak": _plain(figures.powers.peak),
         "steps_to_1e-3": figures.powers.steps,
         "distance_to_instability": figures.distance,
-        "gains": options.name,
+        "gains": found.method,
         "delay": options.delay,
     }
+    if found.note:
+        certificate["gains_note"] = found.note
     specs = {
         i: _spec(scenario, i, network.A, sensor, own, options.delay)
         for i, sensor, own in zip(scenario.nodes, network.sensors, gains, strict=True)

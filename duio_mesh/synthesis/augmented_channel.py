@@ -40,12 +40,16 @@ class Fixed(NamedTuple):
     seed: int
 
 
+class NoCompensator(DesignError):
+    """No draw makes the errors of a component stable."""
+
+
 def channel_gains(
     network: Network, parts: Sequence[Component], fixed: Fixed, compensator: Compensator, progress: Progress
 ) -> list[Gains]:
     """Gains of all nodes, ascending: per component those of all draws and channels with the least sum of ||Phi^t||_F^2.
 
-    Raises DesignError when no draw makes a component's error stable.
+    Raises NoCompensator when no draw makes a component's error stable.
     """
     gains: dict[int, Gains] = {}
     for part in parts:
@@ -55,17 +59,15 @@ def channel_gains(
             F = fixed.F.get(i, mild_filter(sensor.C, sensor.P @ network.A))
             gains[i] = static_gains(F, np.zeros((network.n, network.n)))
             continue
-        progress(f"compensator for nodes {', '.join(map(str, part.ids))}")
-        best = min(
-            (
-                _attempt(network, at, c, k, fixed, compensator)
-                for c in ([part.ids.index(fixed.channel)] if fixed.channel in part.ids else range(len(at)))
-                for k in range(fixed.tries)
-            ),
-            key=lambda found: found[0],
-        )
+        channels = [part.ids.index(fixed.channel)] if fixed.channel in part.ids else range(len(at))
+        attempts = [(c, k) for c in channels for k in range(fixed.tries)]
+        best: tuple[float, list[Gains]] = np.inf, []
+        for done, (c, k) in enumerate(attempts, 1):
+            progress(f"compensator for nodes {', '.join(map(str, part.ids))}: draw {done} of {len(attempts)}")
+            found = _attempt(network, at, c, k, fixed, compensator)
+            best = found if found[0] < best[0] else best
         if not np.isfinite(best[0]):
-            raise DesignError(
+            raise NoCompensator(
                 f"no compensator at one of the nodes {', '.join(map(str, part.ids))} makes their errors stable "
                 f"(stacked order {network.n * len(at)}, {fixed.tries} draws). Use gains: h2."
             )

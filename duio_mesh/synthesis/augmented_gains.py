@@ -3,26 +3,69 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from duio_mesh.arrays import Array
 from duio_mesh.errors import DesignError
+from duio_mesh.geometry.stability import spectral_radius
 from duio_mesh.scenario.model import Scenario
 from duio_mesh.scenario.schema import Matrix
-from duio_mesh.synthesis.augmented_channel import Compensator, Fixed, brasch_pearson, channel_gains, lqg
-from duio_mesh.synthesis.augmented_error import Gains, Network
+from duio_mesh.synthesis.augmented_channel import Compensator, Fixed, NoCompensator, brasch_pearson, channel_gains, lqg
+from duio_mesh.synthesis.augmented_error import ErrorSystem, Gains, Network
 from duio_mesh.synthesis.augmented_existence import components
-from duio_mesh.synthesis.augmented_h2 import h2_gains
+from duio_mesh.synthesis.augmented_h2 import NothingFound, h2_gains
 from duio_mesh.synthesis.augmented_options import H2, BraschPearson, Channel, FixedNode, GivenNode, Options
 from duio_mesh.synthesis.design import Progress
 
 
-def find_gains(scenario: Scenario, network: Network, options: Options, progress: Progress) -> list[Gains]:
-    """The gains of all nodes, in the order of their ids, by the chosen method; not yet verified.
+class Found(NamedTuple):
+    """The gains of all nodes, in the order of their ids, and which method they are from."""
+
+    gains: list[Gains]
+    method: str
+    note: str = ""
+    """Why it is not the method of the file."""
+
+
+def find_gains(scenario: Scenario, network: Network, options: Options, progress: Progress) -> Found:
+    """The gains of all nodes by the chosen method, or by ``lqg`` where ``h2`` finds none; not yet verified.
 
     Raises DesignError for given matrices of wrong shape or unknown nodes, or when the method finds nothing.
     """
+    try:
+        return Found(_by_method(scenario, network, options, progress), options.name)
+    except NothingFound as e:
+        if options.delay:
+            raise DesignError(f"{e} Raise h2.starts or h2.extra_states.") from None
+        if _given_orders(options):
+            raise DesignError(f"{e} Use gains: lqg, or raise h2.starts or h2.extra_states.") from None
+        progress(f"gains: h2 found none; trying lqg ({e})")
+        return Found(_instead(scenario, network, options, progress, str(e)), "lqg", f"{e} Those of lqg are taken.")
+
+
+def _given_orders(options: Options) -> bool:
+    """Whether the file says how many states a node may add; lqg would not keep to that."""
+    chosen = options.chosen()
+    return isinstance(chosen, H2) and "extra_states" in chosen.model_fields_set
+
+
+def _instead(scenario: Scenario, network: Network, options: Options, progress: Progress, refused: str) -> list[Gains]:
+    """The gains of ``gains: lqg``, when they reach the rate. Raises DesignError with both methods' reasons."""
+    advice = "Use gains: lqg with more tries, or raise h2.starts or h2.extra_states."
+    try:
+        gains = _lqg(scenario, network, Channel(), options.rate, progress)
+    except NoCompensator:
+        raise DesignError(f"{refused} gains: lqg, tried next, finds none either. {advice}") from None
+    system = ErrorSystem(network, [len(g.S) for g in gains])
+    radius = spectral_radius(system.matrix(system.theta(gains)))
+    if radius >= options.rate:
+        raise DesignError(f"{refused} gains: lqg, tried next, has the spectral radius {radius:.4g}. {advice}")
+    return gains
+
+
+def _by_method(scenario: Scenario, network: Network, options: Options, progress: Progress) -> list[Gains]:
     chosen, ids = options.chosen(), tuple(scenario.nodes)
     if isinstance(chosen, tuple):
         at = _by_node(chosen, ids, "given")
@@ -38,7 +81,11 @@ def find_gains(scenario: Scenario, network: Network, options: Options, progress:
         raise DesignError("observer.delay: 1 is designed by gains: h2 only")
     if isinstance(chosen, BraschPearson):
         return _through_channels(scenario, network, chosen, (1.0,), brasch_pearson(chosen.radius), progress)
-    return _through_channels(scenario, network, chosen, (0.1, 0.3, 1.0), lqg(options.rate), progress)
+    return _lqg(scenario, network, chosen, options.rate, progress)
+
+
+def _lqg(scenario: Scenario, network: Network, chosen: Channel, rate: float, progress: Progress) -> list[Gains]:
+    return _through_channels(scenario, network, chosen, (0.1, 0.3, 1.0), lqg(rate), progress)
 
 
 def given_H(options: Options, i: int, C: Array, basis: Array) -> Array | None:

@@ -27,13 +27,17 @@ _BRAVE = 10.0  # at least this transient weight while gamma falls: noise alone m
 _STAGES, _PER_STAGE, _LAST = 80, 60, 500
 
 
+class NothingFound(DesignError):
+    """The local search found no gains; others may exist."""
+
+
 def h2_gains(
     network: Network, beta: list[int], transient: float, rate: float, starts: int, seed: int, progress: Progress
 ) -> list[Gains]:
     """Gains of all nodes with spectral radius below ``rate`` and the least J that ``starts`` local searches found.
 
     ``beta`` are the augmented orders; ``transient`` >= 0 is dimensionless; the first start has K = 0, the others are
-    drawn from ``seed``. Raises DesignError when no start reaches ``rate``.
+    drawn from ``seed``. Raises NothingFound when no start reaches ``rate``.
     """
     system = ErrorSystem(network, beta)
     best, value, closest = None, np.inf, np.inf
@@ -53,9 +57,9 @@ def h2_gains(
         if value > J:
             best, value = theta, J
     if best is None:
-        raise DesignError(
+        raise NothingFound(
             f"gains: h2: no gains with a spectral radius below {rate:g} from {starts} starts (closest: {closest:.4g}). "
-            "The search is local, so this proves nothing: raise h2.starts or h2.extra_states, or use gains: lqg."
+            "The search is local, so this proves nothing."
         )
     return system.gains(_unpack(system, best))
 

@@ -16,6 +16,7 @@ from scipy.sparse.csgraph import connected_components
 
 from duio_mesh.arrays import Array
 from duio_mesh.errors import DesignError
+from duio_mesh.geometry.injection import MAX_GAIN
 from duio_mesh.geometry.stability import spectral_radius
 from duio_mesh.geometry.staircase import detectability_decomposition
 from duio_mesh.geometry.subspace import GeometryError, norm
@@ -52,6 +53,7 @@ RADIUS_OF = "sampled error system, per tick"
 
 _SIGMAS = (0.5, 0.0)  # of auto: hand slow modes to the network, or only those that a node must hand over
 _RATES = tuple(3.0 / 2**k for k in range(13))  # of auto: down to 7e-4 1/s, time constants of half an hour
+_MODEST = 1e3  # relative gain: where auto has to give up its first rate, it does not stop at the first possible one
 
 
 class Options(HoldOptions):
@@ -182,14 +184,16 @@ def _choose(scenario: Scenario, separated: Mapping[int, Separated], progress: Pr
 def _with_gains(scenario: Scenario, separated: Mapping[int, Separated], sigma: float, progress: Progress) -> _Network:
     """The nodes' gains with the first rate that they can hold. Raises DesignError when none is or ``_network`` does."""
     options: Options = scenario.options
-    rates = _RATES if options.rate == "auto" else (options.rate,)
-    for rate in rates:
+    tries = _tries(options)
+    for rate, max_gain in tries:
         try:
-            nodes = dict(_nodes(options, separated, sigma, rate))
+            nodes = dict(_nodes(options, separated, sigma, rate, max_gain))
             break
         except RateError as e:
-            if rate == rates[-1]:
-                tried = f" (observer.rate: auto tried {rates[0]:g} halved down to {rate:.2g})" if len(rates) > 1 else ""
+            if (rate, max_gain) == tries[-1]:
+                tried = (
+                    f" (observer.rate: auto tried {_RATES[0]:g} halved down to {rate:.2g})" if len(tries) > 1 else ""
+                )
                 raise DesignError(f"{e}{tried}") from None
     L = scenario.graph.laplacian()
     bound, spread = _network(scenario.graph, L, nodes, sigma)
@@ -198,11 +202,19 @@ def _with_gains(scenario: Scenario, separated: Mapping[int, Separated], sigma: f
     return _Network(sigma, rate, nodes, L, options, bound, spread)
 
 
+def _tries(options: Options) -> list[tuple[float, float]]:
+    """The rates with the relative gains that are accepted: the limit itself only where nothing smaller exists."""
+    if options.rate != "auto":
+        return [(options.rate, MAX_GAIN)]
+    slower = _RATES[1:]
+    return [(_RATES[0], MAX_GAIN), *((rate, _MODEST) for rate in slower), *((rate, MAX_GAIN) for rate in slower)]
+
+
 def _nodes(
-    options: Options, separated: Mapping[int, Separated], sigma: float, rate: float
+    options: Options, separated: Mapping[int, Separated], sigma: float, rate: float, max_gain: float
 ) -> Iterator[tuple[int, _Node]]:
     for i, s in separated.items():
-        gains, bounds = split(s, sigma, rate, f"node {i}"), interval(s, *_bounds(options, s.D1.shape[1]))
+        gains, bounds = split(s, sigma, rate, f"node {i}", max_gain), interval(s, *_bounds(options, s.D1.shape[1]))
         yield i, _Node(s, gains, bounds, local_observer(s, gains, bounds, options.kappa))
 
 

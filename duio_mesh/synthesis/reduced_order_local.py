@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from duio_mesh.arrays import Array
 from duio_mesh.errors import DesignError
-from duio_mesh.geometry.injection import stabilise
+from duio_mesh.geometry.injection import MAX_GAIN, stabilise
 from duio_mesh.geometry.stability import Stability, stable_abscissa
 from duio_mesh.geometry.staircase import detectability_decomposition, observability_decomposition
 from duio_mesh.geometry.subspace import GeometryError, kernel, norm
@@ -154,8 +154,9 @@ def _not_matched(who: str, unknown: Sequence[str], seen: NDArray[np.floating], p
     rank = int(np.sum(seen * WORST_CONDITION > 1))
     return (
         f"{who}: Assumption 2 fails: rank(C~ D) = {rank}, but rank(D) = {q} unknown inputs ({', '.join(unknown)}). "
-        f"Its {p} measurements leave {p - r} without noise; the singular values of C~ D relative to |C~| |D| (rows of C "
-        f"and columns of D of length 1) are {_list(seen)} and must exceed {1 / WORST_CONDITION:g}. Measure states that the unknown inputs drive directly."
+        f"Its {p} measurements leave {p - r} without noise; the singular values of C~ D relative to |C~| |D| (rows of "
+        f"C and columns of D scaled to length 1) are {_list(seen)} and must exceed {1 / WORST_CONDITION:g}. Measure "
+        "states that the unknown inputs drive directly."
     )
 
 
@@ -178,10 +179,11 @@ class Split(NamedTuple):
     own: NDArray[np.complex128]  # eigenvalues of A_d - N_d C_d
 
 
-def split(s: Separated, sigma: float, rate: float, who: str) -> Split:
+def split(s: Separated, sigma: float, rate: float, who: str, max_gain: float = MAX_GAIN) -> Split:
     """Hand the modes of (A22, C22) with Re >= -sigma that w2 does not show to the network, move the visible past -rate.
 
-    Unobservable modes left of -sigma stay where they are: only the observable quotient is assigned.
+    Unobservable modes left of -sigma stay where they are: only the observable quotient is assigned. ``max_gain`` bounds
+    the gain relative to |A| / |C| (``stabilise``).
     Raises RateError when the gain, DesignError when the subspaces cannot be computed reliably.
     """
     try:
@@ -192,7 +194,7 @@ def split(s: Separated, sigma: float, rate: float, who: str) -> Split:
     except GeometryError as e:
         raise DesignError(f"{who}: observer.sigma = {sigma:g}: {e}") from None
     try:
-        Nd = -visible @ stabilise(Cd @ visible, visible.T @ Ad @ visible, stable_abscissa(-rate))
+        Nd = -visible @ stabilise(Cd @ visible, visible.T @ Ad @ visible, stable_abscissa(-rate), max_gain)
     except GeometryError as e:
         raise RateError(
             f"{who}: observer.rate = {rate:g}: its measurements see the visible modes too weakly for a reliable gain "

@@ -111,7 +111,7 @@ class Stacked:
         for i, node in scenario.nodes.items():
             model = Model(scenario.plant.A, scenario.known(i), D, node.C, node.noise.channel)
             s = separate(model, "", ())
-            g, b = split(s, options.sigma, options.rate, ""), interval(s, low, high)
+            g, b = split(s, 0.5, 3.0, ""), interval(s, low, high)
             z1 = np.linalg.inv(s.C11) @ s.W1
             kappa = options.kappa * np.eye(q)
             F.append(np.block([[s.A22 - g.N @ s.C22, np.zeros((n - q, q))], [b.Phi, -kappa]]))

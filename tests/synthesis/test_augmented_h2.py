@@ -11,6 +11,7 @@ from scipy import linalg, optimize
 from duio_mesh import load_scenario, synthesise
 from duio_mesh.errors import DesignError
 from duio_mesh.geometry.stability import spectral_radius
+from duio_mesh.synthesis import synthesise as synthesise_aloud
 from duio_mesh.synthesis.augmented_error import ErrorSystem, Network, Sensor
 from duio_mesh.synthesis.augmented_h2 import Cost, h2_gains, mild_filter
 
@@ -165,6 +166,56 @@ def test_a_wanted_rate_is_kept(name, rate, peak):
 def test_a_rate_that_is_not_reached_is_refused():
     with pytest.raises(DesignError, match=r"no gains with a spectral radius below 1e-05 from 2 starts \(closest: 0\.0"):
         certificate("example9", observer__rate=1e-5, observer__gains={"h2": {"starts": 2}})
+
+
+def hard(tmp_path, observer=""):
+    """Six compartments, two unknown inputs, two nodes: the local search ends at a radius of 1.097 from every start."""
+    A = [
+        [0.66, 0.146, 0.179, 0, 0, 0],
+        [0.146, 0.836, 0, 0, 0, 0],
+        [0.179, 0, 0.572, 0.089, 0.15, 0],
+        [0, 0, 0.089, 0.906, 0, 0],
+        [0, 0, 0.15, 0, 0.678, 0.165],
+        [0, 0, 0, 0, 0.165, 0.828],
+    ]
+    E = [[0.24, 1.14], [-0.46, 0.33], [1.22, -1.67], [-0.87, 0.58], [-1.38, 0.62], [-0.09, 1.12]]
+    both = [[0, 0, 0, 0, 1, 0], [0, 0, 1, 0, 0, 0]]
+    (tmp_path / "hard.yaml").write_text(
+        f"name: hard\nplant: {{time: discrete, period: 1, A: {A}, E: {E}, x0: [0, 0, 0, 0, 0, 0]}}\n"
+        f"observer: {{method: augmented{observer}}}\n"
+        f"nodes:\n  1: {{C: {[[-1.3, -0.89, -1.99, 0.24, -1.21, 1.71], *both]}}}\n  2: {{C: {both}}}\n"
+        "graph: {edges: [[1, 2]]}\nrun: {steps: 100, convergence: {rms_below: 0.1}}\n"
+    )
+    return load_scenario(tmp_path / "hard.yaml")
+
+
+def test_lqg_is_taken_where_the_search_finds_nothing(tmp_path):
+    said = []
+    found = synthesise_aloud(hard(tmp_path), said.append).certificate
+    assert found["gains"] == "lqg"
+    assert found["gains_note"].endswith(
+        "(closest: 1.097). The search is local, so this proves nothing. Those of lqg are taken."
+    )
+    assert any(line.startswith("gains: h2 found none; trying lqg") for line in said)
+    same = synthesise(hard(tmp_path, ", gains: lqg")).certificate
+    assert found["spectral_radius"] == same["spectral_radius"] < 0.95
+    assert "gains_note" not in same
+
+
+@pytest.mark.parametrize(
+    ("observer", "advice"),
+    [
+        (", gains: {h2: {extra_states: 0}}", r"nothing\. Use gains: lqg, or raise h2\.starts or"),  # binding
+        (", delay: 1", r"nothing\. Raise h2\.starts or"),  # lqg has no delay
+        (
+            ", rate: 0.05",
+            r"nothing\. gains: lqg, tried next, (has the spectral radius|finds none).* Use gains: lqg with",
+        ),
+    ],
+)
+def test_what_may_help_is_said_where_h2_finds_nothing(tmp_path, observer, advice):
+    with pytest.raises(DesignError, match=rf"gains: h2: no gains with a spectral radius below .* proves {advice}"):
+        synthesise(hard(tmp_path, observer))
 
 
 def test_the_same_file_gives_the_same_bits():

@@ -11,8 +11,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import linalg
 
-from duio_mesh import DesignError, load_scenario, synthesise
+from duio_mesh import DesignError, load_scenario, simulate, synthesise
+from duio_mesh.geometry.subspace import GeometryError
 from duio_mesh.scenario import model
+from duio_mesh.synthesis import reduced_order, reduced_order_local
+from duio_mesh.synthesis import synthesise as synthesise_aloud
 from duio_mesh.synthesis.reduced_order_local import Model, interval, separate, split
 
 TOPOLOGIES = Path(__file__).parents[2] / "topologies"
@@ -73,6 +76,112 @@ def test_modes_hidden_from_each_node(name, hidden):
         for s in modes:
             pencil = np.block([[s * np.eye(len(A)) - A, D], [quiet, np.zeros((quiet.shape[0], D.shape[1]))]])
             assert np.linalg.svd(pencil, compute_uv=False)[-1] < 1e-9
+
+
+def small(tmp_path, A, E, nodes, observer="", step=0.05, steps=1500):
+    """A continuous plant in a file, nodes on a path."""
+    sensors = "\n".join(f"  {i}: {{C: {C}}}" for i, C in enumerate(nodes, 1))
+    edges = [[i, i + 1] for i in range(1, len(nodes))]
+    (tmp_path / "small.yaml").write_text(
+        f"name: small\nplant: {{time: continuous, A: {A}, E: {E}, x0: {list(range(1, len(A) + 1))}}}\n"
+        f"observer: {{method: reduced_order{observer}}}\nnodes:\n{sensors}\ngraph: {{edges: {edges}}}\n"
+        f"run: {{steps: {steps}, step: {step}, convergence: {{rms_below: 0.1}}}}\n"
+    )
+    return load_scenario(tmp_path / "small.yaml")
+
+
+def last_error(design):
+    trace = simulate(design)
+    return np.abs(trace.xhat - trace.x)[:, -1].max()
+
+
+SLOW = [[-0.3, 0.1, 0], [0.1, -0.3, 0], [0, 0, -0.2]]
+
+
+def test_a_slow_system_takes_the_split_at_zero(tmp_path):
+    """Every node leaves the mode at -0.2 to the network when sigma is 0.5; it goes away by itself."""
+    slow = SLOW, [[1], [0], [0]], [[[1, 0, 0]], [[1, 0, 0], [0, 1, 0]]]
+    said = []
+    design = synthesise_aloud(small(tmp_path, *slow), said.append)
+    assert (design.certificate["sigma"], design.certificate["rate"]) == (0, 3)
+    assert "gains for observer.sigma = 0, observer.rate = 3" in said
+    assert last_error(design) < 1e-5
+    with pytest.raises(DesignError, match=r"With observer\.sigma = 0\.5 a node leaves .* a smaller observer\.sigma or"):
+        synthesise(small(tmp_path, *slow, observer=", sigma: 0.5"))  # a number in the file is binding
+
+
+def test_an_automatic_rate_is_halved_until_gains_are_reliable(tmp_path):
+    """A chain that is seen at its far end only: no double-precision gain makes all of it faster than 3 1/s."""
+    n = 8
+    A = (-0.3 * np.eye(n) + 0.02 * np.eye(n, k=1)).tolist()
+    chain = A, [[0]] * (n - 1) + [[1]], [[[1] + [0] * (n - 1), [0] * (n - 1) + [1]]]
+    with pytest.raises(DesignError, match=r"node 1: observer\.rate = 3: .* a smaller rate may do"):
+        synthesise(small(tmp_path, *chain, observer=", rate: 3"))
+    design = synthesise(small(tmp_path, *chain))
+    assert design.certificate["sigma"] == 0.5
+    assert design.certificate["rate"] in {3 / 2**k for k in range(1, 6)}
+    assert design.certificate["nodes"][1]["gain_norm"] < 1e3  # not the first gain that is barely possible
+    assert last_error(design) < 1e-6
+
+
+def test_what_auto_tried_is_said(tmp_path, monkeypatch):
+    monkeypatch.setattr(reduced_order, "_RATES", (3.0, 1.5))
+    monkeypatch.setattr(reduced_order_local, "stabilise", lambda *_: (_ for _ in ()).throw(GeometryError("no gain")))
+    text = (
+        r"observer\.rate = 1\.5: .*\(observer\.rate: auto tried 3 halved down to 1\.5\) \(observer\.sigma: auto tried"
+    )
+    with pytest.raises(DesignError, match=text):
+        synthesise(load("kundur8"))
+
+
+def test_assumption_1_is_decided_without_a_gain(tmp_path, monkeypatch):
+    """The mode at 0.1 is hidden from all; no Riccati equation is solved before that is said."""
+    monkeypatch.setattr(reduced_order_local, "stabilise", lambda *_: (_ for _ in ()).throw(GeometryError("no gain")))
+    A = [[-1, 0, 0], [0, -2, 0], [0, 0, 0.1]]
+    scenario = small(tmp_path, A, [[1], [0], [0]], [[[1, 0, 0], [0, 1, 0]], [[1, 0, 0]]])
+    with pytest.raises(DesignError, match=r"Assumption 1 fails: .* do not show the modes at \['0\.1'\]"):
+        synthesise(scenario)
+
+
+@pytest.mark.parametrize("small_C", [1e-3, 1e-9])
+@pytest.mark.parametrize("small_E", [1.0, 1e-3, 1e-9])
+def test_units_do_not_decide_assumption_2(tmp_path, small_C, small_E):
+    A, E = [[-1, 0.2, 0.1], [0.1, -2, 0], [0.3, 0, -1]], [[1e3, 0], [0, small_E], [0, 0]]
+    C = [[1e3, 0, 0], [0, small_C, 0]]
+    design = synthesise(small(tmp_path, A, E, [C, C]))
+    assert design.certificate["conditions"]["assumption_2"]["value"] == pytest.approx(1)
+    assert last_error(design) < 1e-6
+
+
+def test_units_of_a_plant_whose_every_state_is_driven(tmp_path):
+    A, I, units = [[-1, 0.2], [0.1, -2]], [[1, 0], [0, 1]], [[1e3, 0], [0, 1e-3]]
+    for E, C in ((I, units), (units, I), (units, units)):
+        assert last_error(synthesise(small(tmp_path, A, E, [C, C], steps=50))) < 1e-9  # x is known from y at once
+
+
+def test_units_of_the_unknown_inputs_do_not_make_them_dependent(tmp_path):
+    E = [[1, 1e-12], [0, 1e-12], [0, 0]]
+    C = [[1, 0, 0], [0, 1, 0]]
+    assert synthesise(small(tmp_path, SLOW, E, [C, C])).certificate["sampled_radius"] < 1
+    with pytest.raises(DesignError, match=r"singular values of D \(columns of length 1\) are \[1\.41\d* 0\.\s*\]"):
+        synthesise(small(tmp_path, SLOW, [[1, 1e-12], [0, 0], [0, 0]], [C, C]))
+
+
+def test_the_scaled_separation_is_one_of_the_model_in_the_files_units():
+    """Outputs, noise and unknown inputs in units far apart; the identities of the transformation still hold."""
+    rng = np.random.default_rng(5)
+    y, f = np.array([1e6, 1.0, 1e-4, 10.0]), np.array([1e4, 1e-4])
+    A, B, D = rng.standard_normal((5, 5)), rng.standard_normal((5, 1)), rng.standard_normal((5, 2)) * f
+    C, F = y[:, None] * rng.standard_normal((4, 5)), y[:, None] * rng.standard_normal((4, 1))
+    s = separate(Model(A, B, D, C, F), "a node", ["f", "g"])
+    assert s.margin > 1e-3
+    for W in (s.W1, s.W2):
+        np.testing.assert_allclose(W @ F, 0, atol=1e-12)
+    T = np.hstack([s.U1, s.V2])
+    np.testing.assert_allclose(s.W1 @ C @ T, np.hstack([s.C11, np.zeros((2, 3))]), atol=1e-12)
+    np.testing.assert_allclose(s.W2 @ C @ s.V2, s.C22, atol=1e-12)
+    np.testing.assert_allclose(s.U1 @ s.D1 / f, D / f, atol=1e-12)
+    np.testing.assert_allclose(A @ T, s.U1 @ np.hstack([s.A11, s.A12]) + s.V2 @ np.hstack([s.A21, s.A22]), atol=1e-12)
 
 
 def network(scenario):
@@ -163,13 +272,19 @@ def test_lemma_7_is_not_enough():
     pairs = [(30, 31), (31, 32), (32, 33), (33, 37), (34, 37), (35, 37), (36, 37), (37, 38)]
     arcs = sorted(model.Arc(i, j, 1.0) for a in range(1, 9) for i, j in [(a, a % 8 + 1), (a % 8 + 1, a)])
     graph = model.Graph(tuple(range(1, 9)), tuple(arcs), False)
-    scenario = with_nodes(load("newengland18"), *(phasor_unit(i, *pair) for i, pair in enumerate(pairs, 1)))
-    scenario = dataclasses.replace(scenario, graph=graph)
+    units = [phasor_unit(i, *pair) for i, pair in enumerate(pairs, 1)]
+    scenario, auto = (
+        dataclasses.replace(with_nodes(load("newengland18", **given), *units), graph=graph)
+        for given in ({"observer__sigma": 0.5}, {})
+    )
     Y, Au, _, L = network(scenario)
     for c in (1, 10, 100, 1000):  # the paper promises that a large c is enough
         assert np.linalg.eigvals(Au - c * Y.T @ np.kron(L, np.eye(18)) @ Y).real.max() > 0.01
     with pytest.raises(DesignError, match=r"1 direction\(s\) of the state are left to the network by every node"):
         synthesise(scenario)
+    found = synthesise(auto).certificate  # the direction is stable: the split at 0 keeps it with a node, slowly
+    assert (found["sigma"], found["rate"]) == (0, 3)
+    assert -0.03 < found["spectral_abscissa"] < 0
 
 
 def test_what_the_method_cannot_do_is_said():
