@@ -6,6 +6,8 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from duio_mesh import launcher, scenario, simulation, synthesis
 from duio_mesh.launcher import RunResult
 from duio_mesh.scenario.model import Scenario
@@ -16,10 +18,18 @@ from duio_mesh.synthesis.design import Design
 def load_scenario(path: str | Path, **overrides: Any) -> Scenario:
     """Read and check a topology file; ``overrides`` are dotted paths into it, e.g. ``**{"run.steps": 500}``.
 
+    Their values are what JSON can say, and numpy's arrays and numbers.
     Raises ScenarioError with one line per problem, each with file:line:column.
     """
-    pairs = [f"{name}={json.dumps(value, ensure_ascii=False)}" for name, value in overrides.items()]
+    pairs = [f"{name}={json.dumps(value, ensure_ascii=False, default=_plain)}" for name, value in overrides.items()]
     return scenario.load_scenario(path, pairs, options_of=synthesis.options_of)
+
+
+def _plain(value: object) -> object:
+    """What JSON does not know by itself: numpy's arrays and numbers."""
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    raise TypeError(f"a topology file has no form for {type(value).__name__}")
 
 
 def synthesise(scenario: Scenario) -> Design:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,6 +13,11 @@ from duio_mesh.errors import DesignError, RunError, ScenarioError
 
 IMAGE = f"duio_mesh:{__version__}"
 START = 600.0  # seconds
+_HOST = r"(?:[A-Za-z0-9.-]+|\[[0-9A-Fa-f:]+\])(?::[0-9]+)?"
+_NAME = r"[a-z0-9]+(?:(?:\.|_{1,2}|-+)[a-z0-9]+)*"
+_REFERENCE = re.compile(  # as in the distribution project: [host[:port]/]name[/name][:tag][@digest]
+    rf"(?:{_HOST}/)?{_NAME}(?:/{_NAME})*(?::\w[\w.-]{{0,127}})?(?:@[A-Za-z][\w.+-]*:[0-9A-Fa-f]{{32,}})?", re.ASCII
+)
 DONE, NOT_CONVERGED, IMPOSSIBLE, FAILED = 0, 1, 2, 3
 
 EXPORT = """\
@@ -20,7 +26,7 @@ Every export is a run of its own: it has its own name on the wire and, with secu
 (valid for 30 days) that only work with each other.
 
 examples:
-  python launch.py topologies/hosts.yaml --dry-run --out runs/site
+  python launch.py topologies/three_hosts.yaml --dry-run --out runs/site
   python launch.py export runs/site --compose
   python launch.py export runs/site --kubernetes --image registry.example/duio_mesh:0.1.0
 """
@@ -56,7 +62,7 @@ def export(argv: Sequence[str]) -> int:
     how.add_argument("--compose", action="store_true", help="one compose.yaml per host of the topology")
     how.add_argument("--kubernetes", action="store_true", help="secrets.yaml, run.yaml and results.yaml")
     p.add_argument("--out", type=Path, metavar="DIR", help="where to (default RUN_DIR/compose or RUN_DIR/kubernetes)")
-    p.add_argument("--image", default=IMAGE, help=f"container image (default {IMAGE})")
+    p.add_argument("--image", type=_image, default=IMAGE, help=f"container image (default {IMAGE})")
     p.add_argument(
         "--start-within",
         type=float,
@@ -77,6 +83,12 @@ def export(argv: Sequence[str]) -> int:
     for path in write(design, out, args.image, args.start_within):
         print(path)
     return DONE
+
+
+def _image(text: str) -> str:
+    if not _REFERENCE.fullmatch(text):
+        raise argparse.ArgumentTypeError(f"should be an image like registry.example/duio_mesh:0.1.0, not {text!r}")
+    return text
 
 
 def gather(argv: Sequence[str]) -> int:

@@ -123,6 +123,7 @@ def _main(args: argparse.Namespace) -> int:
         outcome.take(block)
         if args.step in block.steps:
             shown = True
+            _check_round(block, args.step, args.round)
             show_block(print, spec, block, args.step, args.round, run)
         if args.out and block.estimates:
             rows += [(block, at) for at, k in enumerate(block.steps) if k in wanted]
@@ -133,6 +134,20 @@ def _main(args: argparse.Namespace) -> int:
     if args.step is not None and not shown:
         raise ReplayError(f"step {args.step} is not on the tape of node {spec.id}: {outcome.ending()}")
     return SAME if outcome.verdict(print) else DIFFERENT
+
+
+def _check_round(block: Block, k: int, r: int | None) -> None:
+    """Raise ReplayError when round r is wanted of step k, and there is none in its block."""
+    there = [one.r for one in block.rounds]
+    if r is not None and r not in there:
+        raise ReplayError(f"there is no round {r} in step {k}; its rounds are {_span(there)}")
+
+
+def _span(numbers: Sequence[int]) -> str:
+    """'0 to 3', '0 only' or 'none'."""
+    if len(numbers) > 1:
+        return f"{numbers[0]} to {numbers[-1]}"
+    return f"{numbers[0]} only" if numbers else "none"
 
 
 def _nothing_yet(spec: NodeSpec) -> Estimate:

@@ -19,7 +19,7 @@ Say = Callable[[str], None]
 
 
 def show_block(say: Say, spec: NodeSpec, block: Block, k: int, r: int | None, run: Kept | None) -> None:
-    """Print step k of this block; ``r``: the exchange that is wanted, or None."""
+    """Print step k of this block; ``r``: the exchange that is wanted, or None; the block has it."""
     together = f", fused with steps {block.first} to {block.steps[-1]}" if len(block.steps) > 1 else ""
     say(f"node {spec.id}, step {k}: {spec.method}, {in_words(block.exchanged)}{together}")
     for call in block.calls:
@@ -31,9 +31,7 @@ def show_block(say: Say, spec: NodeSpec, block: Block, k: int, r: int | None, ru
     for one in chosen if len(chosen) <= FEW else (chosen[0], chosen[-1]):
         say(f"round {one.r}")
         _show(say, _exchange(spec, one))
-    if r is not None and not chosen:
-        say(f"  there is no round {r} in this step")
-    elif len(chosen) > FEW:
+    if len(chosen) > FEW:
         say(f"  {len(chosen) - 2} rounds between these two are not shown (--round R)")
     say("estimate")
     _show(say, _estimate(block, k, run))

@@ -7,7 +7,7 @@ from typing import Any
 
 from duio_mesh.faults import ALWAYS, Faults, NodeFault, Rule
 from duio_mesh.scenario import model, schema
-from duio_mesh.scenario.problems import Path, Problems, listed
+from duio_mesh.scenario.problems import Path, Problems, counted, listed
 from duio_mesh.scenario.validate import whole
 
 Arc = tuple[int, int]
@@ -31,6 +31,7 @@ def read_faults(written: Any, graph: model.Graph | None, run: Mapping[str, Any],
     entries += [("cuts", k, cut) for k, cut in enumerate(faults.cuts)]
     for number, (key, k, entry) in enumerate(entries):
         rule = _rule(number, entry, (*path, key, k), problems)
+        _check_step(rule.during[0], (*path, key, k, "during"), run, problems)
         for arc in _arcs(entry, (*path, key, k), graph, problems):
             rules.setdefault(arc, []).append(rule)
     nodes = [_node(fault, (*path, "nodes", k), graph, run, problems) for k, fault in enumerate(faults.nodes)]
@@ -90,6 +91,8 @@ def _node(
     if graph is not None and graph.ids and fault.node not in graph.ids:
         problems.at((*path, "node"), f"no such node: {fault.node}; the nodes are {listed(graph.ids, 'and')}")
     policy, batch = run.get("on_node_loss", "stop"), run.get("batch", 1)
+    what = next(name for name in fault.forms if getattr(fault, name) is not None)
+    _check_step(getattr(fault, what), (*path, what), run, problems)
     if fault.kill is not None:
         if policy == "restart":
             problems.at(
@@ -107,6 +110,13 @@ def _node(
         _check_block(away, (*path, "away"), batch, problems)
         return NodeFault(fault.node, "restart", fault.restart, away=away)
     return NodeFault(fault.node, "pause", fault.pause or 0, fault.seconds or 0.0)
+
+
+def _check_step(step: int, path: Path, run: Mapping[str, Any], problems: Problems) -> None:
+    """A fault that begins after the end would never happen; that it lasts longer than the run does no harm."""
+    steps = run.get("steps")
+    if steps is not None and step >= steps:
+        problems.at(path, f"there is no step {step} in a run of {counted(steps, 'step')}")
 
 
 def _check_block(step: int, path: Path, batch: int, problems: Problems) -> None:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import ipaddress
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from math import inf
 from pathlib import Path as FilePath
 from typing import Any
 
 from duio_mesh.scenario import model, schema
 from duio_mesh.scenario.plant import PLANT
-from duio_mesh.scenario.problems import Path, Problems, counted
+from duio_mesh.scenario.problems import Path, Problems, counted, did_you_mean
 from duio_mesh.scenario.source import read_file
 from duio_mesh.scenario.validate import whole
 from duio_mesh.sensors.messages import SCALAR
@@ -21,6 +21,8 @@ WORD = "external"
 EXTERNAL: Path = (WORD,)
 LISTEN = "tcp/127.0.0.1:7447"  # Zenoh's own port, on this host only
 _ENDPOINT = re.compile(r"tcp/(?P<host>\[[0-9A-Fa-f:.]+\]|[^\s:/\[\]]+):(?P<port>[1-9][0-9]{0,4})")
+_NODE = "{node}"  # in external.key: the id of the node
+_BRACES = re.compile(r"\{[^{}]*\}")
 _CHUNK = re.compile(r"[^/*#?$\s]+|\*")  # of a key expression; ** and $* are more than is needed here
 
 
@@ -59,7 +61,8 @@ def read_external(
     _check_endpoints(written, problems)
     for name in ("key", "end"):
         _check_key((getattr(written, name) or "x").replace("{node}", "1"), (*EXTERNAL, name), problems)
-    feeds = {i: _feed(i, own.get(i), written.key, problems) for i in nodes}
+    template = _template(written.key, [i for i in nodes if i not in own], problems)
+    feeds = {i: _feed(i, own.get(i), template, problems) for i in nodes}
     sizes: dict[str, int] = {}
     for i, node in nodes.items():
         if node is not None:
@@ -123,6 +126,24 @@ def _loopback(host: str) -> bool:
 def _check_key(key: str, path: Path, problems: Problems) -> None:
     if not all(_CHUNK.fullmatch(chunk) for chunk in key.split("/")):
         problems.at(path, f"should be a Zenoh key like building/3/y ('*' for any one part), not {key[:80]}")
+
+
+def _template(key: str | None, users: Sequence[int], problems: Problems) -> str | None:
+    """``external.key``, whose users are the nodes without keys of their own; something like it after a report."""
+    if key is None:
+        return None
+    path = (*EXTERNAL, "key")
+    strangers = [name for name in _BRACES.findall(key) if name != _NODE]
+    for name in strangers:
+        hint = did_you_mean(name, [_NODE]) or f"; only {_NODE} is, by the id of the node"
+        problems.at(path, f"{name} is not replaced by anything{hint}")
+    if _NODE in key or len(users) < 2:
+        return key
+    if not strangers:
+        problems.at(
+            path, f"should have {_NODE} in it: {len(users)} nodes have no keys of their own, and share this one"
+        )
+    return _NODE  # a key each, so that nothing follows from the mistake
 
 
 def _feed(i: int, own: Any, template: str | None, problems: Problems) -> tuple[str, ...]:

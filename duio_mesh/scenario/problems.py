@@ -87,6 +87,10 @@ class Problems:
         """Has the value at ``path``, or one around it, been rejected by the reader?"""
         return any(path[:k] in self._poisoned for k in range(len(path) + 1))
 
+    def silenced_inside(self, path: Path) -> bool:
+        """Has a value inside the one at ``path`` been rejected by the reader?"""
+        return any(p[: len(path)] == path for p in self._poisoned)
+
     def __bool__(self) -> bool:
         return bool(self._found)
 

@@ -79,6 +79,8 @@ def _explain(error: ValidationError, model: type[BaseModel], value: Any, base: P
             problems.at_key(path, "is missing")
         elif fault.context.get("at"):
             problems.at_key((*path, fault.context["at"]), fault.message)
+        elif fault.type == "misfit" and problems.silenced_inside(path):
+            continue  # the key that it asks for is there; the reader has rejected its value
         elif fault.type not in ("missing", "extra_forbidden"):
             problems.at(path, _words(fault, _reach(value, fault.loc)))
     return misspelt
@@ -202,7 +204,7 @@ def _words(fault: _Fault, value: Any) -> str:
 
 def _text_rule(fault: _Fault, value: str) -> str:
     if fault.type == "string_pattern_mismatch":
-        return f"should be letters, digits, '.', '_' and '-' only, not {describe(value)}"
+        return f"should begin with a letter or digit and have only these, '.', '_' and '-' in it, not {describe(value)}"
     if fault.type == "string_too_short":
         return "should not be empty"
     return f"should have at most {fault.context['max_length']} characters, not {len(value)}"

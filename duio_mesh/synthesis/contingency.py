@@ -38,7 +38,7 @@ def contingency(design: Design, number: int = 1, progress: Progress = lambda _: 
     Raises DesignError when the method has no error matrix to offer or ``number`` is less than 1.
     """
     if number < 1:
-        raise DesignError(f"contingency: should be at least 1 edge or node, not {number}")
+        raise DesignError(f"--contingency: should be at least 1 edge or node, not {number}")
     case = Cases(design, progress)
     nominal = case(Loss())
     cases = [case(loss) for loss in losses(design.scenario.graph, number)]
@@ -72,7 +72,7 @@ class Cases:
 
     def __call__(self, loss: Loss) -> dict[str, Any]:
         """The case of one loss."""
-        self._progress(f"contingency: {loss.words(self._graph) or 'nothing lost'}")
+        self._progress(f"--contingency: {loss.words(self._graph) or 'nothing lost'}")
         left = without(self._graph, loss)
         islands = {ids: restricted(left, ids) for ids in left.islands()}
         radii = {ids: self._radius(island) for ids, island in islands.items()}
@@ -95,7 +95,7 @@ def radius_of(design: Design) -> str:
 def _method(design: Design) -> ModuleType:
     method = importlib.import_module(f"duio_mesh.synthesis.{design.scenario.method}")
     if not hasattr(method, "error_radius"):
-        raise DesignError(f"contingency: {design.scenario.method} says nothing about its errors on another graph")
+        raise DesignError(f"--contingency: {design.scenario.method} says nothing about its errors on another graph")
     return method
 
 

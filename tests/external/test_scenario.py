@@ -83,6 +83,16 @@ def test_nodes_with_keys_of_their_own(tmp_path: Path) -> None:
     assert found.sizes == {"a/*": 1, "shared": 1, "u": 1}
 
 
+def test_a_key_for_all_is_one_mistake_unless_one_node_uses_it(tmp_path: Path) -> None:
+    misspelt = written(tmp_path, ("hall/{node}/y", "hall/{nod}/y"))
+    with pytest.raises(ScenarioError) as refused:
+        load(misspelt)
+    (problem,) = refused.value.problems
+    assert problem.endswith("tiny.yaml:5:8: external.key: {nod} is not replaced by anything (did you mean {node}?)")
+    alone = written(tmp_path, ("hall/{node}/y", "hall"), ("C: [[0, 1]]", "C: [[0, 1]], keys: b"))
+    assert outside(load(alone)).feeds == {1: ("hall",), 7: ("b",)}
+
+
 LOOSE = ("  key: hall/{node}/y\n", "  key: hall/{node}/y\n  listen: tcp/0.0.0.0:7447\n")
 
 
@@ -102,7 +112,15 @@ def test_listening_beyond_this_host_has_to_be_said(tmp_path: Path) -> None:
         ([("  key: hall/{node}/y\n", "")], "tiny.yaml:7:3: nodes.1.keys: is missing: external.key is not given"),
         ([("hall/{node}/y", "hall//{node}")], "tiny.yaml:5:8: external.key: should be a Zenoh key"),
         ([("hall/{node}/y", "hall/**")], "tiny.yaml:5:8: external.key: should be a Zenoh key"),
-        ([("hall/{node}/y", "hall")], "tiny.yaml:9:3: nodes.7.keys: hall carries 3 of another node's numbers, and 1"),
+        ([("hall/{node}/y", "hall")], "tiny.yaml:5:8: external.key: should have {node} in it: 2 nodes have no keys"),
+        (
+            [("hall/{node}/y", "'{id}/{node}'")],
+            "tiny.yaml:5:8: external.key: {id} is not replaced by anything; only {node}",
+        ),
+        (
+            [("C: [[1, 0], [0, 1]]", "C: [[1, 0], [0, 1]], keys: a"), ("C: [[0, 1]]", "C: [[0, 1]], keys: a")],
+            "tiny.yaml:9:20: nodes.7.keys: a carries 3 of another node's numbers, and 1",
+        ),
         (
             [("C: [[0, 1]]", "C: [[0, 1]], keys: [a, b]")],
             "tiny.yaml:9:26: nodes.7.keys: should be one key for all numbers, or 1 (1 measurement), not 2",

@@ -16,6 +16,7 @@ from ruamel.yaml import YAML
 
 import duio_mesh
 from duio_mesh.cli import main
+from duio_mesh.deploy import command
 from duio_mesh.health import wire_of
 from duio_mesh.mesh.keys import Keys
 from duio_mesh.mesh.passage import passage
@@ -177,6 +178,17 @@ def assert_reachable(form: str, containers: list[Container]) -> None:
         assert set(c.wire.connect) <= listening.keys()
 
 
+def test_an_image_is_a_reference(capsys: pytest.CaptureFixture[str]) -> None:
+    for text in ("a b;c", "", "Upper", "a:b:c", "a\n", "http://a/b", "a@sha256:1"):
+        with pytest.raises(SystemExit) as ended:
+            main(["export", "nothing", "--compose", "--image", text])
+        assert ended.value.code == 2
+        assert "should be an image like" in capsys.readouterr().err
+    for text in (command.IMAGE, "localhost:5000/a/b", "R.example/a__b-c.d:V1.0", f"[::1]:5000/a:1@sha256:{'0' * 64}"):
+        assert main(["export", "nothing", "--compose", "--image", text]) != 0  # there is no such run
+        assert "image" not in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("form", ["compose", "kubernetes"])
 def test_an_open_run_has_to_be_asked_for_by_name(form: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert export(form, "security=open") == 2
@@ -202,6 +214,7 @@ def test_an_open_run_that_was_asked_for_by_name_has_no_credentials() -> None:
 )
 def test_what_cannot_be_done_is_said(arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert export("compose") == 0
+    (SITE / "compose" / "plant.f64").touch()  # something to gather
     assert main(arguments) in (2, 3)
     assert said in capsys.readouterr().err
 

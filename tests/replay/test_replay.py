@@ -117,7 +117,8 @@ def test_what_is_wrong_with_a_folder_is_said(capsys: pytest.CaptureFixture[str])
     assert "38 steps are equal" in shown
     assert "from 2" in shown
     assert "from 4" in shown
-    assert "there is no round 1" in said(0, "--step", "37", "--round", "1")
+    assert "round 0\n" in said(0, "--step", "37", "--round", "0")
+    assert "there is no round 1 in step 37; its rounds are 0 only" in said(2, "--step", "37", "--round", "1")
     assert "11 steps are equal" in said(0, "--from", "10", "--until", "20", "--out", "some.npz")
     with np.load("some.npz", allow_pickle=False) as rows:
         assert list(rows["step"]) == list(range(10, 21))

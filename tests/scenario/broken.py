@@ -147,6 +147,8 @@ SYNTAX = [
 NUMBERS = [
     case("nan in A", ("[0.0, 0.5]]", "[0.0, §.nan]]"), words="plant.A.1.1: should be a finite number, not .nan"),
     case("inf in C", ("C: [[1, 0]]", "C: [[§-.inf, 0]]"), words="nodes.1.C.0.0: should be a finite number"),
+    case("nan where one of several keys is needed", ("{variance: 0.01}", "{variance: §.nan}"),
+         words="plant.noise.variance: should be a finite number, not .nan"),
     case("overflow", ("period: 1.0", "period: §1e999"), words="should be a finite number, not 1e999"),
     case("nan as a word", ("rms_below: 0.5", "rms_below: §nan"), words="should be a number, not the text 'nan'"),
     case("underscore number", ("steps: 10", "steps: §1_000"), words="should be a whole number, not the text '1_000'"),
@@ -163,7 +165,8 @@ NUMBERS = [
 
 TOP = [
     case("no name", ("name: tiny\ndescription", "§description"), words="name: is missing"),
-    case("name with a slash", ("name: tiny", "name: §../tiny"), words="should be letters, digits"),
+    case("name with a slash", ("name: tiny", "name: §t/tiny"), words="have only these, '.', '_' and '-' in it"),
+    case("name that begins with _", ("name: tiny", "name: §_x"), words="should begin with a letter or digit"),
     case("name is a number", ("name: tiny", "name: §7"), words="should be text, not 7"),
     case("empty name", ("name: tiny", "§name:"), words="should be text, not nothing"),
     case("description is a list", ("description: Two states, two nodes", "description: §[1]"), words="should be text"),
@@ -475,6 +478,12 @@ FAULTS = [
     faulty("edge with a weight", "{links: [{edges: [§[1, 2, 3]], loss: 0.1}]}", "should have at most 2 entries, not 3"),
     faulty("no edges", "{links: [{edges: §[], loss: 0.1}]}", "faults.links.0.edges: should have at least 1 entry"),
     faulty("during ends before it begins", "{links: [{loss: 0.1, §during: [8, 8]}]}", "should end after it begins"),
+    faulty("during begins after the end", "{links: [{loss: 0.1, during: §[10, 12]}, {loss: 0.1, during: [9, 99]}]}",
+           "faults.links.0.during: there is no step 10 in a run of 10 steps"),
+    faulty("cut after the end", "{cuts: [{edges: [[1, 2]], during: §[20, 30]}]}", "there is no step 20 in a run of 10"),
+    faulty("kill after the end", "{nodes: [{node: 1, kill: §10}, {node: 2, kill: 9}]}",
+           "faults.nodes.0.kill: there is no step 10 in a run of 10 steps"),
+    faulty("pause after the end", "{nodes: [{node: 1, pause: §500, seconds: 1}]}", "pause: there is no step 500"),
     faulty("two delays", "{links: [{delay: {steps: 1, §rounds: 1}}]}", "give either steps or rounds, not both"),
     faulty("delay without a unit", "{links: [{delay: §1}]}", "faults.links.0.delay: should be a mapping, not 1"),
     faulty("empty delay", "{links: [{delay: §{}}]}", "should have one of the keys steps or rounds"),

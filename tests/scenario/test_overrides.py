@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import duio_mesh
 from duio_mesh.errors import ScenarioError
 from duio_mesh.scenario.model import OpenLoop
 from tests.scenario.broken import PLANT_FILE, VALID, without
@@ -43,6 +44,15 @@ def test_values_are_replaced(topology: Path) -> None:
     assert s.graph.directed
     assert s.document["run"]["steps"] == 8
     assert s.document["plant"]["noise"] == {"variance": 4}
+
+
+def test_the_python_interface_takes_numpy(topology: Path) -> None:
+    changes = {"plant.A": np.eye(2) / 2, "run.steps": np.int64(5), "plant.noise": {"variance": np.float32(0.25)}}
+    s = duio_mesh.load_scenario(topology, **changes, **{"observer.local_gain": "hinf"})
+    assert np.array_equal(s.plant.A, np.eye(2) / 2)
+    assert s.run.steps == 5
+    with pytest.raises(TypeError, match="no form for object"):
+        duio_mesh.load_scenario(topology, **{"plant.A": object()})
 
 
 def test_keys_are_added_and_emptied(topology: Path) -> None:
