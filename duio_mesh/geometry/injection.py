@@ -24,6 +24,11 @@ from duio_mesh.geometry.subspace import RTOL, GeometryError, as_pair, kernel, no
 MAX_GAIN = 1e6
 """Default bound on ||M||_2 relative to ||A||_2 / ||C||_2; far beyond it rounding moves the poles."""
 
+_CURE = (
+    "The outputs hardly see this part: measure it better or more directly, or choose units of states and outputs in "
+    "which the matrices' entries have similar sizes"
+)
+
 _CANDIDATES = 32  # random directions tried per placement; the smallest gain wins
 _COEFFICIENTS = 1e-7  # relative error of the characteristic polynomial that still counts as placed
 
@@ -109,7 +114,8 @@ def _has_spectrum(A: Array, poles: NDArray[np.complex128], size: float) -> bool:
 def stabilise(C: Array, A: Array, stability: Stability, max_gain: float = MAX_GAIN) -> Array:
     """M (n, p) with eig(A + M C) inside ``stability`` for an observable pair: a Kalman-type gain (Riccati equation).
 
-    Process noise I and measurement noise ||C||^2 I for the shifted (Re) or scaled (modulus) system.
+    Process noise I and measurement noise ||C||^2 I for the shifted (Re) or scaled (modulus) system: with A = 0 the
+    gain is already 1 / ||C||, so that ||M|| may be max_gain times max(||A||, |bound|, 1) / ||C||.
     Raises GeometryError when the Riccati equation has no solution, the result misses the region or ||M|| is too large.
     """
     C, A = as_pair(C, A)
@@ -121,18 +127,26 @@ def stabilise(C: Array, A: Array, stability: Stability, max_gain: float = MAX_GA
         if stability.time == "discrete":
             F = A / stability.bound
             X = linalg.solve_discrete_are(F.T, C.T, Q, R)
-            M = -stability.bound * linalg.solve(R + C @ X @ C.T, C @ X @ F.T, assume_a="pos").T
+            # outputs in very different units make this matrix ill-conditioned, not the solution; ``solve`` would warn
+            M = -stability.bound * linalg.cho_solve(linalg.cho_factor(R + C @ X @ C.T), C @ X @ F.T).T
         else:
             X = linalg.solve_continuous_are((A - stability.bound * np.eye(n)).T, C.T, Q, R)
             M = -np.linalg.solve(R, C @ X).T
-    except linalg.LinAlgError as e:
-        raise GeometryError(f"no stabilising output injection exists for this pair and {stability} ({e})") from None
-    limit = max_gain * max(norm(A), abs(stability.bound), 1e-300) / max(norm(C), 1e-300)
-    values = np.linalg.eigvals(A + M @ C)
-    if not stability.stable(values) or norm(M) > limit:
+    except (linalg.LinAlgError, ValueError) as e:  # ValueError: "Reordering of (A, B) failed"
         raise GeometryError(
-            f"the output injection of norm {norm(M):.1e} (limit {limit:.1e}) leaves eigenvalues at "
-            f"{np.round(values[stability.bad(values)], 6).tolist()}, outside {stability}"
+            f"no stabilising output injection can be computed for this pair and {stability} ({e}). {_CURE}"
+        ) from None
+    values = np.linalg.eigvals(A + M @ C)
+    if not stability.stable(values):
+        left = np.round(values[stability.bad(values)], 6).tolist()
+        raise GeometryError(
+            f"the output injection of norm {norm(M):.1e} leaves eigenvalues at {left}, outside {stability}. {_CURE}"
+        )
+    limit = max_gain * max(norm(A), abs(stability.bound), 1.0) / max(norm(C), 1e-300)
+    if norm(M) > limit:
+        raise GeometryError(
+            f"the output injection that reaches {stability} has norm {norm(M):.1e}, above {limit:.1e}: rounding and "
+            f"noise would be multiplied by that. {_CURE}"
         )
     return np.asarray(M)
 
@@ -160,6 +174,8 @@ def reduced_observer(
     lengths = np.linalg.norm(C, axis=1)
     units = np.where(lengths > 0, lengths, 1.0)
     H = kernel((C / units[:, None] @ W).T, rtol, scale=1.0).T / units  # rows: the outputs that vanish on W
+    # of measurements that say the same twice, their difference vanishes everywhere: rounding, not an output
+    H = H[np.linalg.norm(H @ C, axis=1) > rtol]
     Abar, Cbar = P @ (A + L @ C) @ P.T, H @ C @ P.T
     parts = observability_decomposition(Cbar, Abar, rtol)
     fixed, D = parts.eigenvalues, parts.D

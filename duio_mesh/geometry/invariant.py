@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from duio_mesh.arrays import Array
 from duio_mesh.geometry.stability import Stability, split_spectrum
+from duio_mesh.geometry.staircase import _unobservable
 from duio_mesh.geometry.subspace import (
     RTOL,
     GeometryError,
@@ -79,16 +80,19 @@ def _infimal_invariant(C: Array, A: Array, B: Array, rtol: float) -> tuple[Array
 def infimal_unobservability(C: Array, A: Array, W: Array, rtol: float = RTOL) -> Array:
     """S*: the infimal unobservability subspace containing W = W*, by S <- W + (A^-1 S and Ker C), from S = X.
 
-    Raises GeometryError when the recursion has not settled after n + 2 steps; in exact arithmetic it needs at most n.
+    With W = 0 it is the unobservable subspace, found by the staircase for it.
+    Raises GeometryError when the recursion has not settled after 2 n + 4 steps; in exact arithmetic it needs at most n.
     """
     return _infimal_unobservability(C, A, W, rtol)[0]
 
 
 def _infimal_unobservability(C: Array, A: Array, W: Array, rtol: float) -> tuple[Array, Rank]:
+    if not W.shape[1]:
+        return _unobservable(unit_rows(C), A, rtol)
     n, size = A.shape[0], norm(A)
     K, margin = kernel_with_margin(unit_rows(C), rtol, scale=1.0)
     S: Array = np.eye(n)
-    for _ in range(n + 2):
+    for _ in range(2 * n + 4):  # rounding may hold a dimension up for some turns
         back, decided = kernel_with_margin(residual(S, A @ K), rtol, scale=size)
         smaller, added = add_with_margin(W, K @ back, rtol)
         margin = margin.worst(decided).worst(added)
@@ -96,8 +100,9 @@ def _infimal_unobservability(C: Array, A: Array, W: Array, rtol: float) -> tuple
             return smaller, margin
         S = smaller
     raise GeometryError(
-        f"the unobservability subspace did not settle within {n + 2} steps at rtol = {rtol:g}: the matrices probably "
-        "carry errors larger than that; choose an rtol at least ten times their relative error"
+        f"the unobservability subspace did not settle within {2 * n + 4} steps: whether some direction is seen "
+        f"is undecided between {rtol:g} and rounding. Measure more of the state, let more inputs be known, or give A "
+        "and the inputs with more digits"
     )
 
 
@@ -133,7 +138,11 @@ def unknown_input_structure(C: Array, A: Array, B: Array, stability: Stability, 
     L = friend(C, A, W, rtol)
     Q = image(residual(W, S), rtol, scale=1.0)  # orthonormal, represents S*/W*
     if excess(W, S) > np.sqrt(rtol) or Q.shape[1] != S.shape[1] - W.shape[1]:
-        raise GeometryError(f"the unobservability subspace lost a part of W* at rtol = {rtol:g}; choose another rtol")
+        raise GeometryError(
+            f"the unobservability subspace lost a part of W*: whether a direction that the unknown inputs reach is "
+            f"seen is undecided at {rtol:g}. Measure more of the state, or choose units in which the matrices' entries "
+            "have similar sizes"
+        )
     Z, bad, good = split_spectrum(Q.T @ (A + L @ C) @ Q, stability)
     V = Q @ Z
     return InputStructure(W, S, V, np.hstack([W, V]), L, np.concatenate([bad, good]), bad, decided.worst(also))

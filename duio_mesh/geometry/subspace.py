@@ -169,7 +169,8 @@ def unit_rows(C: Array, rounding: float = 0.0) -> Array:
     keep = largest > rounding * largest.max(initial=0.0)
     # by a power of 2 first, which changes no digit, so that the squares of tiny entries do not underflow
     rows: Array = np.ldexp(C[keep], -np.frexp(largest[keep])[1][:, None])
-    return rows / np.asarray(np.linalg.norm(rows, axis=1))[:, None]
+    unit: Array = rows / np.linalg.norm(rows, axis=1)[:, None]
+    return unit
 
 
 def unit_columns(B: Array, rounding: float = 0.0) -> Array:

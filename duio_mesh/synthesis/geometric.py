@@ -33,9 +33,12 @@ from duio_mesh.synthesis.sampled import (
     modes,
     sampled,
 )
-from duio_mesh.synthesis.uio import check_decoupled
+from duio_mesh.synthesis.uio import check_quotient
 
 RADIUS_OF = "sampled error system, per tick; the larger of two: sign term saturated, and around zero"
+
+
+_CURE = "more edges, another sensor, a further known input or kappa > 0 (own damping inside W_g of nodes of group N2)"
 
 
 class Options(HoldOptions):
@@ -72,8 +75,7 @@ def design(scenario: Scenario, progress: Progress) -> Design:
         progress(f"node {i}: subspaces and local gains")
         args = node.C, plant.A, scenario.known(i), scenario.unknown(i)
         nodes[i] = local_uio(*args, options.poles, options.kappa, f"node {i}")
-        W = nodes[i].structure.W
-        check_decoupled(np.eye(plant.n) - W @ W.T, scenario, i)
+        check_quotient(nodes[i].structure, scenario, i)
     conditions = _conditions(scenario, nodes)
     progress("choosing the coupling")
     L, h = graph.laplacian(), plant.step
@@ -91,7 +93,7 @@ def design(scenario: Scenario, progress: Progress) -> Design:
             for slope in (near, dict.fromkeys(nodes, 0.0))
         )
 
-    chi = choose_gain("chi", options.chi, growth, rho, h, L)
+    chi = choose_gain("chi", options.chi, growth, rho, h, L, _CURE)
     bounds = bounds_21(scenario, nodes)
     needed = bounds["gamma_needed"]
     if needed is not None:

@@ -19,6 +19,9 @@ from duio_mesh.synthesis.spectral import least_radius
 
 Island = tuple[int, ...]
 
+CLEAR = 1e-9
+"""How far beta_u has to be below 0, and a spectral radius below 1, to be more than rounding."""
+
 
 def couple_islands(scenario: Scenario, nodes: Mapping[int, Local], progress: Progress) -> Network:
     """g, island by island: (38) is the maximum over islands, so each may take its own best without raising it.
@@ -46,7 +49,7 @@ def _gains(scenario: Scenario, island: Island, nodes: Mapping[int, Local], say: 
     found = couple(_parts(island, nodes), laplacian, "paper" if options.consensus == "paper" else "norm", say)
     if options.consensus == "schur":
         return _schur(island, found, say)
-    if not found.beta < 0:  # instead of (40): the sign also says by how much
+    if not found.beta < -CLEAR:  # instead of (40): the sign also says by how much
         raise DesignError(_infeasible(island, found, nodes, options))
     return found
 
@@ -67,11 +70,10 @@ def _laplacian(graph: Graph, island: Island) -> Any:
 def _schur(island: Island, start: Coupling, say: Say) -> Coupling:
     """A g whose Phi_u is Schur, whatever its norm."""
     g, radius = least_radius(start.pencil, start.g, say)
-    if not radius < 1 - 1e-9:
+    if not radius < 1 - CLEAR:
         raise DesignError(
             f"consensus: schur found no stabilising gains for {_who(island)}: the least spectral radius of Phi_u found "
-            f"is {radius:.6g} (a search, not a proof that none exist). {_advice()}; or use method: augmented, whose "
-            "condition is exact."
+            f"is {radius:.6g} (a search, not a proof that none exist). {_advice(island)}{_exact(island)}."
         )
     return coupling(g, None, start.lower, start.pencil)
 
@@ -86,12 +88,12 @@ def _robust(scenario: Scenario, island: Island, nodes: Mapping[int, Local], say:
     }
     pencils = {name: _pencil(island, nodes, graph) for name, graph in graphs.items()}
     best = minimise_largest_eigenvalue(list(pencils.values()), say)
-    if not best.value < 1:
+    if not best.value < 1 - CLEAR:
         alone = {}
         for name, pencil in pencils.items():
             say(f"{name}, on its own")
             alone[name] = minimise_largest_eigenvalue([pencil]).lower - 1
-        hopeless = {name: beta for name, beta in alone.items() if beta >= 0}
+        hopeless = {name: beta for name, beta in alone.items() if beta >= -CLEAR}
         if hopeless:
             cause = "impossible whatever the others ask: " + _listed(hopeless)
         else:
@@ -118,20 +120,28 @@ def _who(island: Island) -> str:
     return f"nodes {', '.join(map(str, island))}" if len(island) <= 8 else f"{len(island)} nodes from {island[0]}"
 
 
-def _advice() -> str:
+def _advice(island: Island) -> str:
+    if len(island) == 1:
+        return "No other node's estimate corrects it: let it hear a node, measure more or know more inputs"
     return "To change it: add edges or measurements; let nodes know more inputs"
+
+
+def _exact(island: Island) -> str:
+    """A node alone has no coupling to choose: what it cannot see, it cannot see with any method."""
+    return "; or use method: augmented, whose condition is exact" if len(island) > 1 else ""
 
 
 def _infeasible(island: Island, found: Coupling, nodes: Mapping[int, Local], options: Any) -> str:
     criterion = "(38)-(39)" if options.consensus == "paper" else "min ||A_u - Theta(g)||_2^2 - 1"
     dimensions = ", ".join(str(nodes[i].parts.nu) for i in island)
-    advice = _advice()
+    size = "> 0" if found.beta > CLEAR else "not below 0 by more than rounding,"
+    advice = _advice(island)
     if options.decomposition == "observability":
         advice += "; try decomposition: detectability, which leaves less to the neighbours"
     if len(island) > 1:
         advice += "; try consensus: schur, which asks for stability only"
     return (
-        f"the consensus design is infeasible: beta_u = {found.beta:+.3g} > 0 on {_who(island)} (the least value of "
+        f"the consensus design is infeasible: beta_u = {found.beta:+.3g} {size} on {_who(island)} (the least value of "
         f"{criterion}, lower bound {found.lower:+.3g}; nu = {dimensions}). It asks more than stability: that the sum "
-        f"of |U_i'e_i|^2 falls in every step. {advice}; or use method: augmented, whose condition is exact."
+        f"of |U_i'e_i|^2 falls in every step. {advice}{_exact(island)}."
     )

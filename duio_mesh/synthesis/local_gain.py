@@ -24,6 +24,10 @@ TOLERANCE = 1e-6
 """Relative accuracy of the H-infinity bound."""
 
 
+NEARLY = 1e-6
+"""An own spectral radius this close to 1 is not taken as stable without a gain: its error would never vanish."""
+
+
 class Subsystem(NamedTuple):
     """The detectable part of one node."""
 
@@ -69,7 +73,7 @@ def hinf_gain(system: Subsystem, node: str) -> tuple[Array, float]:
     in milliseconds and without the ill-conditioned P of (34). The accepted beta is confirmed by a frequency sweep; when
     it is not, rounding has misled the bisection, and every step of a second one is confirmed.
     """
-    if not system.F.any() and spectral_radius(system.A) < 1:
+    if not system.F.any() and spectral_radius(system.A) < 1 - NEARLY:  # rounding prints an eigenvalue 1 as 1 - 1e-16
         return np.zeros((len(system.A), len(system.C))), 0.0  # nothing to decouple, nothing to stabilise
     for confirmed in (False, True):
         K, beta = _bisection(system, node, confirmed)

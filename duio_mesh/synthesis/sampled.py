@@ -32,6 +32,10 @@ _INTERPOLATION: dict[Hold, Array] = {
 _ENOUGH = 0.95  # of the best decay rate: more coupling than that costs robustness and gains nothing
 _MARGIN = 1.5  # in the step
 
+SCHUR = 1 - 1e-9
+"""What a sampled error's spectral radius has to stay below: rounding prints an eigenvalue 1 as 1 - 1e-16. In continuous
+time it is an abscissa below log(SCHUR) / step."""
+
 
 class HoldOptions(Absence):
     """Options that every sampled continuous observer has."""
@@ -115,42 +119,58 @@ def choose_gain(
     radius_at: Callable[[float, float], float],
     h: float,
     laplacian: Array,
+    cure: str = "more edges",
 ) -> float:
     """The coupling gain called ``name``: as wanted, or the smallest whose error decays about as fast as with any.
 
     ``abscissa_at(gain)`` and ``radius_at(gain, step)`` belong to the error system in continuous time and sampled.
-    ``auto`` keeps a distance: its gain is stable at 1.5 times the step h too.
-    Raises DesignError with these numbers when the wanted gain, or every gain tried, is unstable.
+    ``auto`` keeps a distance: its gain is stable at 1.5 times the step h too. Stable means by more than rounding.
+    Raises DesignError with these numbers when the wanted gain, or every gain tried, is unstable; ``cure`` (words) is
+    what helps where no step does.
     """
     strongest = float(np.abs(np.linalg.eigvals(laplacian)).max(initial=0.0))
     if not strongest:  # nobody listens to anybody
         return 0.0 if wanted == "auto" else wanted
     if wanted != "auto":
         growth = abscissa_at(wanted)
-        if growth >= 0:
+        if growth * h >= np.log(SCHUR):
             raise DesignError(
                 f"observer.{name} = {wanted:g} is unstable at any step: the error system has an eigenvalue with real "
-                f"part {growth:.4g} (must be negative). Use {name}: auto, or more edges"
+                f"part {growth:.4g} (must be negative, by more than rounding). Use {name}: auto, or {cure}"
             )
         rho = radius_at(wanted, h)
-        if rho >= 1:
+        if rho >= SCHUR:
+            digits = 4 if rho >= 1 else 10
             raise DesignError(
                 f"observer.{name} = {wanted:g} is unstable at run.step = {h:g} s: the spectral radius of the sampled "
-                f"error system is {rho:.4f} and must be below 1 (step x {name} x |lambda|max(L) is "
+                f"error system is {rho:.{digits}f} and must be below 1 (step x {name} x |lambda|max(L) is "
                 f"{h * wanted * strongest:.3g}; above 2 no step is stable). Use {name}: auto, or another {name} or step"
             )
         return wanted
     grid = np.geomspace(1e-4, 1, 49) * 2 / (h * strongest)
     radii = np.array([max(radius_at(gain, h), 1e-300) for gain in grid])
-    safe = np.array([rho < 1 and radius_at(gain, _MARGIN * h) < 1 for gain, rho in zip(grid, radii, strict=True)])
+    safe = np.array([max(rho, radius_at(gain, _MARGIN * h)) < SCHUR for gain, rho in zip(grid, radii, strict=True)])
     if not safe.any():
+        _refuse_any_step(name, abscissa_at, h, strongest, cure)
         raise DesignError(
             f"no {name} between {grid[0]:.3g} and {grid[-1]:.3g} makes the sampled error system stable at run.step = "
             f"{h:g} s and at {_MARGIN} times that: its least spectral radius is {radii.min():.6f}. Use a shorter step "
-            "or more edges"
+            f"or {cure}"
         )
     rates = np.where(safe, -np.log(radii), -np.inf)
     return float(grid[np.argmax(rates >= _ENOUGH * rates.max())])
+
+
+def _refuse_any_step(name: str, abscissa_at: Callable[[float], float], h: float, strongest: float, cure: str) -> None:
+    """Raise DesignError when the error is unstable in continuous time too, with any gain that a shorter step allows."""
+    grid = np.geomspace(1e-4, 1e4, 65) * 2 / (h * strongest)
+    least = min(abscissa_at(gain) for gain in grid)
+    if least * h >= np.log(SCHUR):
+        raise DesignError(
+            f"no {name} between {grid[0]:.3g} and {grid[-1]:.3g} makes the error system stable, not even in continuous "
+            f"time: the least real part of its slowest eigenvalue is {least:.3g} (must be negative, by more than "
+            f"rounding). A shorter step cannot help; use {cure}"
+        )
 
 
 def modes(values: NDArray[np.complex128]) -> list[str]:
@@ -160,12 +180,12 @@ def modes(values: NDArray[np.complex128]) -> list[str]:
 
 
 def largest_step(sampled_radius: Callable[[float], float], start: float, limit: float = 10.0) -> float:
-    """The step (s) at which ``sampled_radius`` first reaches 1, between ``start`` and ``limit``, to 1 %.
+    """The step (s) at which ``sampled_radius`` first reaches 1 (SCHUR), between ``start`` and ``limit``, to 1 %.
 
     Returns 0 when ``start`` itself is unstable and ``limit`` when nothing up to it is.
     """
     low, high = start, start
-    while sampled_radius(high) < 1:
+    while sampled_radius(high) < SCHUR:
         if high >= limit:
             return limit
         low, high = high, min(1.25 * high, limit)
@@ -173,5 +193,5 @@ def largest_step(sampled_radius: Callable[[float], float], start: float, limit: 
         return 0.0
     while high > 1.01 * low:
         middle = float(np.sqrt(low * high))
-        low, high = (middle, high) if sampled_radius(middle) < 1 else (low, middle)
+        low, high = (middle, high) if sampled_radius(middle) < SCHUR else (low, middle)
     return low

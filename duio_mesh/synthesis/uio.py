@@ -10,11 +10,15 @@ from numpy.typing import NDArray
 
 from duio_mesh.arrays import Array
 from duio_mesh.errors import DesignError
+from duio_mesh.geometry import InputStructure
 from duio_mesh.geometry.subspace import RTOL, image, norm, rank, unit_columns, unit_rows
 from duio_mesh.scenario.model import Scenario
 
 HELD = 1e-9
 """What may be left of an unknown input in a state, relative to the terms that cancel there."""
+
+INSIDE = 1e-6
+"""How far W* may be from (C, A)-invariant in a state, relative to the terms there: the end of a chain of decisions."""
 
 ROUNDING = 1e-13
 """What rounding leaves where nothing has to cancel, relative to the whole projection and the whole column."""
@@ -94,6 +98,30 @@ def check_decoupled(P: Array, scenario: Scenario, i: int) -> None:
         excess = left - HELD * terms - ROUNDING * max(norm(P), 1.0) * np.abs(b).max(initial=0.0)
         if (excess > 0).any():
             raise DesignError(_leaks(f"node {i}", name, b, left, terms, int(np.argmax(np.where(excess > 0, left, 0)))))
+
+
+def check_quotient(structure: InputStructure, scenario: Scenario, i: int) -> None:
+    """``check_decoupled`` for an observer on X/W*, and that what the unknown inputs reach stays inside W*.
+
+    (I - W W') b = 0 for every unknown column and (I - W W') (A + L C) W = 0, state by state: the recursion for W*
+    compares directions with ||A||_2, so in bad units it may stop before it has reached a state.
+    Raises DesignError that names the node, the input or the state, and the cure.
+    """
+    W, C, A = structure.W, scenario.nodes[i].C, scenario.plant.A
+    P = np.eye(len(A)) - W @ W.T
+    check_decoupled(P, scenario, i)
+    if not W.shape[1]:
+        return
+    closed = A + structure.L @ C
+    left, terms = np.abs(P @ closed @ W), np.abs(P) @ np.abs(closed) @ np.abs(W)
+    excess = left - INSIDE * terms - ROUNDING * norm(closed)
+    if (excess > 0).any():
+        k = int(np.argmax(excess.max(axis=1)))
+        raise DesignError(
+            f"node {i}: the inputs that it is not told reach state x{k + 1}, but in double precision this is lost "
+            f"beside the largest entries of A ({np.abs(A).max():.2g}): its own estimate would not be free of them. "
+            "Choose units of the states so that the entries of A and of every input's column have similar sizes."
+        )
 
 
 def _unknown_names(scenario: Scenario, i: int) -> list[str]:

@@ -13,6 +13,7 @@ from scipy.optimize import linear_sum_assignment
 
 from duio_mesh.geometry import (
     GeometryError,
+    Stability,
     place,
     reduced_observer,
     stabilise,
@@ -94,6 +95,40 @@ def test_stabilise_enters_the_region(n: int, p: int, bound: float, seed: int) ->
 def test_stabilise_refuses_what_it_cannot_see() -> None:
     with pytest.raises(GeometryError, match=r"\|lambda\| < 1"):
         stabilise(np.array([[1.0, 0.0]]), np.diag([0.5, 1.5]), stable_radius(1.0))
+
+
+def test_stabilise_says_which_of_two_things_failed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A gain that is too large for the limit is not a wrong spectrum; and an integrator needs a gain of 1, not 0."""
+    C = np.eye(1)
+    assert stabilise(C, np.zeros((1, 1)), stable_abscissa()) == pytest.approx(-1, rel=1e-5)
+    with pytest.raises(GeometryError, match=r"has norm 1\.0e\+00, above 1\.0e-01.*measure it better"):
+        stabilise(C, np.zeros((1, 1)), stable_abscissa(), max_gain=0.1)
+    monkeypatch.setattr("scipy.linalg.solve_continuous_are", lambda *_: np.zeros((1, 1)))
+    with pytest.raises(GeometryError, match=r"leaves eigenvalues at \[.*measure it better"):
+        stabilise(C, np.ones((1, 1)), stable_abscissa())
+
+
+@pytest.mark.parametrize("region", [stable_radius(), stable_abscissa()])
+@pytest.mark.parametrize("error", [ValueError("Reordering of (A, B) failed"), np.linalg.LinAlgError("no solution")])
+def test_a_riccati_equation_that_fails_is_a_geometric_answer(
+    monkeypatch: pytest.MonkeyPatch, region: Stability, error: Exception
+) -> None:
+    def fail(*_: object) -> None:
+        raise error
+
+    monkeypatch.setattr("scipy.linalg.solve_continuous_are", fail)
+    monkeypatch.setattr("scipy.linalg.solve_discrete_are", fail)
+    with pytest.raises(GeometryError, match=r"can be computed for this pair .*measure it better"):
+        stabilise(np.eye(1), np.eye(1), region)
+
+
+def test_a_measurement_that_repeats_another_is_no_further_output() -> None:
+    """Both see W, and their difference sees nothing but rounding: the mode 2 outside W cannot be moved."""
+    A, B, C = np.diag([0.5, 2.0]), np.array([[1.0], [0.0]]), np.array([[0.1, 0.7], [0.3, 2.1]])
+    W = unknown_input_structure(C, A, B, stable_radius()).W
+    assert W.shape[1] == 1
+    with pytest.raises(GeometryError, match="fixed and outside"):
+        reduced_observer(C, A, W, stable_radius())
 
 
 @settings(max_examples=60, deadline=None, derandomize=True)

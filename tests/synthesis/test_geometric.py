@@ -166,3 +166,29 @@ def test_what_the_method_cannot_do_is_said():
         synthesise(dataclasses.replace(scenario, graph=dataclasses.replace(scenario.graph, directed=True)))
     with pytest.raises(DesignError, match=r"node 1: 2 poles can be placed .* but only 1 are given"):
         synthesise(load(observer__poles=[-2]))
+
+
+MARGINAL = """
+name: marginal
+plant:
+  time: continuous
+  A: [[0, 1, 0, 0], [0, 0, 0, 0], [0, 0, 0, 1], [0, 0, 0, 0]]
+  B: [[0, -1.29], [0, -1.69], [0, -1.12], [1, 0.89]]
+  inputs: [u0, u1]
+  control: {signals: {u0: {constant: {value: 1}}, u1: {constant: {value: 1}}}}
+  x0: [0, 0, 0, 0]
+observer: {method: geometric}
+nodes:
+  1: {C: [[0, 0, 0, 1], [1, 0, 0, 0]], knows: [u0]}
+  2: {C: [[0, 0, 0, 1], [0, 1, 0, 0]]}
+graph: {edges: [[1, 2]]}
+run: {steps: 10, step: 0.01, convergence: {rms_below: 1}}
+"""
+
+
+@pytest.mark.parametrize("chi", ["auto", 1.0])
+def test_a_marginal_error_system_is_refused(tmp_path, chi):
+    (tmp_path / "marginal.yaml").write_text(MARGINAL, "utf-8")
+    words = "A shorter step cannot help; .* kappa" if chi == "auto" else "chi = 1 is unstable at any step: .* kappa"
+    with pytest.raises(DesignError, match=words):
+        synthesise(load_scenario(tmp_path / "marginal.yaml", **{"observer.chi": chi}))

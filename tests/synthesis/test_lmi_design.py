@@ -88,6 +88,49 @@ def test_six_state_without_edges_names_the_first_lone_node():
         certificate("six_state_ring", graph__edges=[])
 
 
+def lone_node(folder, A, C, noise="{std: 0}", gain="hinf"):
+    lines = [
+        "name: lone",
+        f"plant: {{time: discrete, period: 1, A: {A}, x0: [1, 2]}}",
+        f"observer: {{method: lmi, local_gain: {gain}}}",
+        f"nodes: {{1: {{C: {C}, noise: {noise}}}}}",
+        "graph: {edges: []}",
+        "run: {steps: 10, convergence: {rms_below: 0.01}}",
+    ]
+    (folder / "lone.yaml").write_text("\n".join(lines), "utf-8")
+    return load_scenario(folder / "lone.yaml")
+
+
+def test_a_marginal_plant_is_stabilised_not_believed(tmp_path):
+    found = synthesise(lone_node(tmp_path, [[0.7, 0.3], [0.3, 0.7]], [[1, 0]])).certificate
+    assert found["spectral_radius"] == pytest.approx(0.927, abs=1e-3)
+
+
+def test_a_marginal_mode_of_a_lone_node_is_refused_without_false_advice(tmp_path):
+    with pytest.raises(DesignError, match=r"beta_u = [+-]\S+ not below 0 .*on node 1, which hears nobody") as e:
+        synthesise(lone_node(tmp_path, [[1, 0], [0, 0.5]], [[0, 1]]))
+    assert "let it hear a node" in str(e.value)
+    assert "augmented" not in str(e.value)
+
+
+@pytest.mark.parametrize("noise", ["{std: 0}", "{std: 1}"])
+def test_predicted_noise_does_not_depend_on_units_of_the_states(tmp_path, noise):
+    """As one linear system the Lyapunov equation is singular in these units, and scipy warns."""
+    rms = [
+        synthesise(lone_node(tmp_path, A, C, noise, "{poles: [0.1, 0.2]}")).certificate["nodes"][1]["predicted_rms"]
+        for A, C in (([[0.9, 1], [0, 0.9]], [[1, 0]]), ([[0.9, 1e9], [0, 0.9]], [[1e-9, 0]]))
+    ]
+    assert rms[1] == pytest.approx(1e9 * rms[0], rel=0.5)  # x1 in other units, and it has the larger share of both
+    assert (rms[0] > 0) == ("1" in noise)
+
+
+def test_conditions_ask_for_more_than_rounding(tmp_path, monkeypatch):
+    """Every error matrix that is Schur by rounding only is refused, wherever it comes from."""
+    monkeypatch.setattr("duio_mesh.synthesis.local_gain.NEARLY", 0.0)
+    with pytest.raises(DesignError, match=r"does not hold .*\(31\) is Schur: (1|0\.9999999\d*), needed 0\.999999999"):
+        synthesise(lone_node(tmp_path, [[0.7, 0.3], [0.3, 0.7]], [[1, 0]]))
+
+
 def test_detectable_nodes_need_nobody():
     """Heat with the detectability decomposition: every node can do it alone, so nothing is coupled."""
     found = certificate("ring", observer__decomposition="detectability")

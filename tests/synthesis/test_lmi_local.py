@@ -133,3 +133,10 @@ def test_poles_that_double_precision_cannot_place_are_refused():
     chain = np.eye(n, k=1) + np.diag(np.linspace(1.0, 1.3, n))
     with pytest.raises(DesignError, match=r"node 2: poles 0 to 0\.1 are too hard to place"):
         placed_gain(Subsystem(chain, np.eye(1, n), np.zeros((n, 1))), 0.0, 0.1, "node 2")
+
+
+def test_an_eigenvalue_that_rounds_below_one_gets_a_gain():
+    system = Subsystem(np.array([[0.7, 0.3], [0.3, 0.7]]), np.eye(1, 2), np.zeros((2, 1)))
+    assert np.abs(np.linalg.eigvals(system.A)).max() == pytest.approx(1, abs=1e-15)
+    K, _ = hinf_gain(system, "node 1")
+    assert np.abs(np.linalg.eigvals(system.A - K @ system.C)).max() < 0.95

@@ -97,3 +97,13 @@ def test_gains_are_chosen_refused_and_keep_a_distance_to_the_longest_step():
 
 def test_nobody_to_listen_to_needs_no_gain():
     assert choose_gain("c", "auto", lambda _: 1.0, lambda _, __: 2.0, 0.1, np.zeros((1, 1))) == 0.0
+
+
+@pytest.mark.parametrize("wanted", ["auto", 2.0])
+def test_a_gain_that_is_stable_by_rounding_only_is_refused(wanted):
+    L = np.array([[1.0, -1.0], [-1.0, 1.0]])
+    with pytest.raises(DesignError, match=r"cannot help; use an axe|at any step.* or an axe"):
+        choose_gain("c", wanted, lambda _: -1e-16, lambda _, __: 1 - 1e-15, 0.1, L, "an axe")
+    with pytest.raises(DesignError, match=r"no c .* Use a shorter step|unstable at run\.step = 0\.1 s"):
+        choose_gain("c", wanted, lambda _: -1.0, lambda _, __: 1 - 1e-15, 0.1, L)
+    assert largest_step(lambda h: 1 - 1e-15, 0.1) == 0
