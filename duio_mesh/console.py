@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import contextlib
 import math
+import os
 import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from typing import Any
 
+from rich.cells import cell_len
 from rich.console import Console
 from rich.markup import escape
+from rich.padding import Padding
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 from rich.table import Column, Table
+from rich.text import Text
 
 from duio_mesh import launcher
 from duio_mesh.launcher import RunResult
@@ -27,9 +31,38 @@ MANY = 16  # nodes or warnings, from which on only some are shown
 QUIET = 5.0  # seconds without a word about a design in a log
 RATE = len("10,000 steps/s")
 FEW = 8  # nodes whose errors are shown one by one
+CELL = 24  # characters of a table's cell; what is longer has lines of its own below
 
-_out = Console(highlight=False)
-_err = Console(stderr=True, highlight=False)
+APART = ("conditions", "nodes", "contingency", "node_loss")  # of a certificate: has a table of its own
+
+Part = str | tuple[str, str]
+"""Of a line: the text, or the text and its style."""
+
+
+class Terminal(Console):
+    """A console that takes what it prints as it is, and outlives its reader.
+
+    Names and paths are the user's: a bracket in them is no markup, and a word between colons no emoji.
+    """
+
+    def __init__(self, *, stderr: bool = False) -> None:
+        super().__init__(stderr=stderr, highlight=False, markup=False, emoji=False)
+
+    def on_broken_pipe(self) -> None:
+        """The reader has seen enough (`| head`): that says nothing about the run, so its exit code stays."""
+        self.quiet = True
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        with contextlib.suppress(OSError):  # a stream without a descriptor
+            os.dup2(nowhere, self.file.fileno())  # what Python still holds for it when it exits goes there too
+        os.close(nowhere)
+
+    def say(self, *parts: Part) -> None:
+        """Print one line, which stays one in a log or a pipe however long it is."""
+        self.print(Text.assemble(*parts), soft_wrap=True)
+
+
+_out = Terminal()
+_err = Terminal(stderr=True)
 
 
 @contextlib.contextmanager
@@ -41,7 +74,7 @@ def working(on: str) -> Iterator[Callable[[str], None]]:
         nonlocal last
         if time.monotonic() - last >= QUIET:
             last = time.monotonic()
-            _err.print(f"{on}: {part}", soft_wrap=True, markup=False)
+            _err.say(f"{on}: {part}")
 
     if not _err.is_terminal:
         yield line
@@ -76,7 +109,7 @@ def progress(design: Design) -> Iterator[launcher.Show]:
 def clock(design: Design, *, processes: bool) -> None:
     """What a run on the wall clock is about to do, above all how long it will take."""
     if words := in_words(design.scenario.timing, design.plant.steps, processes=processes):
-        _err.print(words, soft_wrap=True)
+        _err.say(words)
 
 
 def errors_in_words(errors: Mapping[int, float]) -> str:
@@ -102,70 +135,86 @@ class Watcher:
 
     def started(self, url: str) -> None:
         """The live server is there."""
-        _err.print(f"watch live  rerun {url}", soft_wrap=True)
+        _err.say(f"watch live  rerun {url}")
 
     def ended(self, url: str) -> None:
         """The run is over; returns when the server may go, at once where nobody is at the terminal."""
         if sys.stdin.isatty():
-            _err.print(f"the run is over and still served at {url}; press Enter to end", soft_wrap=True)
+            _err.say(f"the run is over and still served at {url}; press Enter to end")
             sys.stdin.readline()
 
 
 def result(design: Design, result: RunResult, *, live: bool) -> None:
     """The table of errors, the verdict, and where everything is."""
-    scenario, metrics = design.scenario, result.metrics
-    table = Table()
-    _out.print(f"[bold]{scenario.name}[/]: {scenario.method}, {len(scenario.nodes)} nodes, {metrics['steps']} steps")
-    figures = {"RMS error": "rms", "final error": "final"}
-    good, bad, what = "converged", "did not converge", "every node's RMS error"
-    if scenario.outside:  # no truth, no error
-        figures = {"disagreement": "disagreement", "residual": "residual"}
-        good, bad = "the nodes agree", "the nodes do not agree"
-        what = "every node's distance from the mean estimate, and what it measures from what the others expect,"
-    for column in ("node", *figures):
-        table.add_column(column, justify="right")
-    names = list(figures.values())
-    for name, node in chosen(metrics["nodes"], names[0]):
-        table.add_row(name, *(_number(node[name]) for name in names))
-    _out.print(table)
-    wanted = scenario.run.convergence
-    words = f"[green]{good}[/]" if result.converged else f"[red]{bad}[/]"
-    if said := metrics.get("remarks"):
-        words += f"[yellow]{', but ' if result.converged else '; '}{'; '.join(said)}[/]"
-    _out.print(
-        f"{words}: {what} over the last {wanted.over_last:.0%} of the run "
-        f"{'is' if result.converged else 'should be'} below {wanted.rms_below:g}"
-    )
-    if scenario.outside:
-        _out.print("(the true state is not known: that the nodes agree does not prove that they are right)")
-    losses = metrics.get("recovery", [])
+    _title(design, _count(result.metrics["steps"], "step"))
+    _errors(design, result)
+    _verdict(design, result)
+    losses = result.metrics.get("recovery", [])
     for loss in losses[:FEW]:
-        _out.print(loss_in_words(loss))
-    if len(losses) > FEW:
-        _out.print(f"and {len(losses) - FEW} further losses (recovery in metrics.json)")
+        _out.say(loss_in_words(loss))
+    if more := len(losses) - len(losses[:FEW]):
+        _out.say(f"and {_count(more, 'further loss', 'further losses')} (recovery in metrics.json)")
     for warning in result.warnings[:MANY]:
-        _out.print(f"[yellow]warning:[/] {warning}")
-    if len(result.warnings) > MANY:
-        _out.print(f"and {len(result.warnings) - MANY} further warnings (logs/)")
-    _out.print(f"results    {result.folder}")
+        _out.say(("warning:", "yellow"), f" {warning}")
+    if more := len(result.warnings) - len(result.warnings[:MANY]):
+        _out.say(f"and {_count(more, 'further warning')} (logs/)")
+    _out.say(f"results    {result.folder}")
     recording = result.folder / "recording.rrd"
     if recording.exists():
-        _out.print(f"open with  rerun {recording}", soft_wrap=True)
+        _out.say(f"open with  rerun {recording}")
+
+
+def _title(design: Design, *further: str) -> None:
+    """Which file, which method, how many nodes."""
+    scenario = design.scenario
+    _out.say((scenario.name, "bold"), ": ", ", ".join((scenario.method, _count(len(scenario.nodes), "node"), *further)))
+
+
+def _errors(design: Design, result: RunResult) -> None:
+    """How far every node was off."""
+    figures = {"RMS error": "rms", "final error": "final"}
+    if design.scenario.outside:  # no truth, no error
+        figures = {"disagreement": "disagreement", "residual": "residual"}
+    names = list(figures.values())
+    table = Table(*(_column(name, right=True) for name in ("node", *figures)))
+    for name, node in chosen(result.metrics["nodes"], names[0]):
+        table.add_row(name, *(_number(node[name]) for name in names))
+    _out.print(table)
+
+
+def _verdict(design: Design, result: RunResult) -> None:
+    """Whether it converged, what that means, and what is to be said against it."""
+    good, bad, what = "converged", "did not converge", "every node's RMS error"
+    if design.scenario.outside:
+        good, bad = "the nodes agree", "the nodes do not agree"
+        what = "every node's distance from the mean estimate, and what it measures from what the others expect,"
+    wanted = design.scenario.run.convergence
+    words: list[Part] = [(good, "green") if result.converged else (bad, "red")]
+    if said := result.metrics.get("remarks"):
+        words.append((f"{', but ' if result.converged else '; '}{'; '.join(said)}", "yellow"))
+    _out.say(
+        *words,
+        f": {what} over the last {100 * wanted.over_last:.3g}% of the run "
+        f"{'is' if result.converged else 'should be'} below {wanted.rms_below:g}",
+    )
+    if design.scenario.outside:
+        _out.say("(the true state is not known: that the nodes agree does not prove that they are right)")
 
 
 def certificate(design: Design) -> None:
     """What the design promises."""
     found = design.certificate
-    _out.print(f"[bold]{design.scenario.name}[/]: {design.scenario.method}, {len(design.nodes)} nodes")
-    conditions = Table("condition", "value", "needed", "", title="conditions")
+    _title(design)
+    conditions = Table(*map(_column, ("condition", "value", "needed")), Column(no_wrap=True), title="conditions")
     for name, condition in found["conditions"].items():
-        mark = "[green]ok[/]" if condition["ok"] else "[red]no[/]"
+        mark = Text("ok", "green") if condition["ok"] else Text("no", "red")
         conditions.add_row(name, _text(condition["value"]), _text(condition["threshold"]), mark)
     _out.print(conditions)
-    _out.print(_by_node(found["nodes"]))
-    for name, value in found.items():
-        if name not in ("conditions", "nodes", "contingency", "node_loss"):
-            _out.print(f"{name:24} {_text(value)}")
+    _by_node(found["nodes"])
+    plain = {name: value for name, value in found.items() if name not in APART}
+    width = max(map(len, plain), default=0)
+    for name, value in plain.items():
+        _out.print(f"{name:{width}} {_text(value)}")
     if cases := found.get("node_loss"):
         title = f"when a node is lost ({design.scenario.run.on_node_loss}): spectral radius of {radius_of(design)}"
         shown = chosen({case["lost"]: case for case in cases.values()}, "radius")
@@ -178,54 +227,99 @@ def certificate(design: Design) -> None:
 
 def _losses(title: str, cases: Collection[Mapping[str, Any]], shown: Iterable[Mapping[str, Any]]) -> None:
     """What is left after each loss, and the worst of ``cases``."""
-    table = Table("lost", "radius", "the rest", title=title)
+    table = Table(*map(_column, ("lost", "radius", "the rest")), title=title)
     for case in shown:
-        words = "[green]reconstructs[/]"
-        if (left := rest(case)) is Rest.BAD:
-            islands = " and ".join(_text(ids) for ids in case["failing"])
-            words = f"[red]does not:[/] nodes {escape(islands)}"
-        elif left is Rest.SLOW:
-            words = f"[yellow]too slowly:[/] a step leaves {case['left']:.0%} of the error"
-        table.add_row(case["lost"], _text(case["radius"]), words)
+        table.add_row(case["lost"], _text(case["radius"]), _rest(case))
     _out.print(table)
     worst = max(cases, key=badness, default=None)
     counts = Counter(map(rest, cases))
     slowly = f", {counts[Rest.SLOW]} of them too slowly" if counts[Rest.SLOW] else ""
-    _out.print(f"{'worst':24} {worst['lost'] if worst else '-'}")
-    _out.print(f"{'survives':24} {len(cases) - counts[Rest.BAD]} of {len(cases)}{slowly}")
+    _out.say(f"{'worst':24} {worst['lost'] if worst else '-'}")
+    _out.say(f"{'survives':24} {len(cases) - counts[Rest.BAD]} of {len(cases)}{slowly}")
 
 
-def _by_node(nodes: Mapping[Any, Mapping[str, Any]]) -> Table:
-    """One row per quantity where the nodes are few, one row per node where they are many."""
+def _rest(case: Mapping[str, Any]) -> Text:
+    """What the others still do after a loss."""
+    if (left := rest(case)) is Rest.BAD:
+        islands = " and ".join(_text(ids) for ids in case["failing"])
+        return Text.assemble(("does not:", "red"), f" nodes {islands}")
+    if left is Rest.SLOW:
+        return Text.assemble(("too slowly:", "yellow"), f" a step leaves {case['left']:.0%} of the error")
+    return Text("reconstructs", "green")
+
+
+def _by_node(nodes: Mapping[Any, Mapping[str, Any]]) -> None:
+    """One row per quantity where the nodes are few, one row per node where they are many; then what is long."""
     quantities = [key for key, value in next(iter(nodes.values())).items() if not isinstance(value, Mapping)]
+    columns = {key: [_text(node.get(key)) for node in nodes.values()] for key in quantities}
+    short = {key: cells for key, cells in columns.items() if max(map(cell_len, cells)) <= CELL}
     if len(nodes) > FEW:
-        table = Table("node", *quantities, title="nodes")
-        for i, node in nodes.items():
-            table.add_row(str(i), *(_text(node.get(key)) for key in quantities))
-        return table
-    table = Table("", *(f"node {i}" for i in nodes), title="nodes")
-    for key in quantities:
-        table.add_row(key, *(_text(node.get(key)) for node in nodes.values()))
-    return table
+        _side_by_side("node", list(map(str, nodes)), short)
+    else:
+        cells = zip(*short.values(), strict=True)
+        _side_by_side("", list(short), {f"node {i}": list(own) for i, own in zip(nodes, cells, strict=bool(short))})
+    for key in (key for key in columns if key not in short):
+        _out.say(f"{key}:")
+        lines = Table.grid(Column(no_wrap=True), Column(overflow="fold"), padding=(0, 1))
+        for i, text in zip(nodes, columns[key], strict=True):
+            lines.add_row(f"node {i}", text)
+        _out.print(Padding(lines, (0, 0, 0, 2), expand=False))
+
+
+def _side_by_side(corner: str, names: list[str], columns: Mapping[str, list[str]]) -> None:
+    """A table with a row for each of ``names``, or several below one another where it is wider than the console."""
+
+    def width(head: str, cells: Iterable[str]) -> int:
+        return max(map(cell_len, (head, *cells))) + len("│  ")
+
+    first = width(corner, names) + len("│")
+    groups: list[list[str]] = []
+    room = 0
+    for head, cells in columns.items():
+        if not groups or width(head, cells) > room:
+            groups.append([])
+            room = _out.width - first
+        groups[-1].append(head)
+        room -= width(head, cells)
+    for at, group in enumerate(groups, 1):
+        title = "nodes" if len(groups) == 1 else f"nodes ({at} of {len(groups)})"
+        table = Table(Column(corner, no_wrap=True), *map(_column, group), title=title)
+        for row in zip(names, *(columns[head] for head in group), strict=True):
+            table.add_row(*row)
+        _out.print(table)
+
+
+def _column(name: str, *, right: bool = False) -> Column:
+    """A column whose cells are broken where they do not fit, never cut."""
+    return Column(name, justify="right" if right else "left", overflow="fold")
 
 
 def plan(design: Design, *, record: bool) -> None:
     """What a run would start, and who would talk to whom."""
     if outside := design.plant.outside:
         where = f"listens on {outside.listen}" if outside.listen else f"connects to {outside.connect}"
-        _say("duio-gateway", "gateway", "gateway", f"{where} for {', '.join(outside.sizes)}")
+        _process("duio-gateway", "gateway", f"{where} for {', '.join(outside.sizes)}")
     else:
-        _say("duio-plant", "plant", "plant", f"measures for {_text(list(design.nodes))}")
+        _process("duio-plant", "plant", f"measures for {_text(list(design.nodes))}")
     for i, spec in design.nodes.items():
-        talks = f"hears {_text(list(spec.hears))}, tells {_text(list(spec.tells))}"
-        _say(f"duio-node-{i}", "node", f"node-{i}", talks)
+        _process(f"duio-node-{i}", "node", f"hears {_text(list(spec.hears))}, tells {_text(list(spec.tells))}")
     if record:
-        _say("duio-recorder", "recorder", "recorder", "hears everybody")
-    _out.print(f"{design.plant.steps} steps; links on loopback, along the edges, to the plant and to the recorder only")
+        _process("duio-recorder", "recorder", "hears everybody")
+    steps = _count(design.plant.steps, "step")
+    _out.say(f"{steps}; links on loopback, along the edges, to the plant and to the recorder only")
+    _out.say(
+        "each is a Python module with its own spec, which gets its endpoints when a run starts or by `launch.py export`"
+    )
 
 
-def _say(name: str, module: str, spec: str, talks: str) -> None:
-    _out.print(f"{name:14} python -m duio_mesh.{module} --spec nodes/{spec}.spec   {talks}", soft_wrap=True)
+def _process(name: str, module: str, what: str) -> None:
+    """One process: its name, what it runs (no command: without endpoints it could not), what it does."""
+    _out.say(f"{name:14} {f'duio_mesh.{module}':18}  {what}")
+
+
+def _count(number: int, one: str, many: str = "") -> str:
+    """The number and its noun: 1 node, 2 nodes."""
+    return f"{number} {one if number == 1 else many or f'{one}s'}"
 
 
 def _number(value: float | None) -> str:

@@ -19,7 +19,9 @@ AXES = 12  # nodes or states that one figure shows
 LINES = 16  # lines in one axes
 POINTS = 4000  # of one line; more are thinned to the least and the greatest of every stretch
 DPI = 120
+FEW = 3  # steps, below which a line is little or nothing and needs markers to be seen
 SHADE = "#d29922"  # of flagged steps
+GREY = "0.5"  # of the legend's "flagged" where every node has its own colour for it
 
 
 def figures(folder: Path, scenario: Scenario, trace: Trace) -> list[Path]:
@@ -28,7 +30,8 @@ def figures(folder: Path, scenario: Scenario, trace: Trace) -> list[Path]:
     errors.png (every node's error, one line per state), error_norms.png (log scale, all nodes), states.png,
     estimates.png (every state with all nodes' estimates), and, where the method reconstructs them,
     unknown_inputs.png and noise.png. Steps whose estimates the node flags are shaded in a node's own axes, and where
-    nodes share one their lines have a broad shade there. Raises OSError when a file cannot be written.
+    nodes share one their lines have a broad shade there. Where not all nodes, states or inputs have room the title says
+    how many are shown. Raises OSError when a file cannot be written.
     """
     drawing = _Drawing(folder, scenario, trace)
     if drawing.known:
@@ -51,11 +54,12 @@ class _Drawing:
         self.known = not len(trace.x) or not np.isnan(trace.x).all()  # whether somebody knew the true state
         self._hours = bool(len(trace.t)) and float(trace.t[-1]) >= 7200
         self._time = trace.t / 3600 if self._hours else trace.t
+        self._states = range(trace.x.shape[1])
         self.written: list[Path] = []
 
     def errors(self) -> None:
         """One axes per node, one line per state: as the papers show them."""
-        states = spread(range(self._trace.x.shape[1]), LINES)
+        nodes, states = spread(self._ids, AXES), spread(self._states, LINES)
 
         def draw(axes: Any, i: int) -> None:
             _distinct(axes, len(states))
@@ -66,7 +70,8 @@ class _Drawing:
             axes.set(title=f"node {i}", ylabel=rf"$\hat x_{{{i}}} - x$")
             axes.axhline(0, color="0.6", lw=0.6, zorder=0)
 
-        self._grid("errors.png", "Estimation errors", spread(self._ids, AXES), draw, share=True)
+        title = self._title("Estimation errors", self._of_nodes(nodes), self._of_states(states))
+        self._grid("errors.png", title, nodes, draw, share=True)
 
     def error_norms(self) -> None:
         """All nodes' 2-norms on a log scale."""
@@ -78,23 +83,24 @@ class _Drawing:
                 self._own_line(axes, i, norms, lw=1.1)
             axes.set(ylabel=r"$\log_{10} \|\hat x_i - x\|_2$")
 
-        self._grid("error_norms.png", "Estimation error norms", [0], draw)
+        self._grid("error_norms.png", self._title("Estimation error norms"), [0], draw)
 
     def states(self) -> None:
         """The true states in one axes."""
 
+        states = spread(self._states, LINES)
+
         def draw(axes: Any, _: int) -> None:
-            states = spread(range(self._trace.x.shape[1]), LINES)
             _distinct(axes, len(states))
             for c in states:
                 self._line(axes, self._trace.x[:, c], label=f"$x_{{{c + 1}}}$", lw=1.1)
             axes.set(ylabel="$x$")
 
-        self._grid("states.png", "States of the plant", [0], draw)
+        self._grid("states.png", self._title("States of the plant", self._of_states(states)), [0], draw)
 
     def estimates(self) -> None:
         """One axes per state: the truth, and what every node thinks of it."""
-        nodes = spread(self._ids, LINES)
+        nodes, states = spread(self._ids, LINES), spread(self._states, AXES)
 
         def draw(axes: Any, c: int) -> None:
             if self.known:
@@ -104,30 +110,50 @@ class _Drawing:
                 self._own_line(axes, i, own)
             axes.set(title=f"$x_{{{c + 1}}}$")
 
-        title = "States and their estimates" if self.known else "Estimates"
-        self._grid("estimates.png", title, spread(range(self._trace.x.shape[1]), AXES), draw)
+        what = "States and their estimates" if self.known else "Estimates"
+        title = self._title(what, self._of_nodes(nodes), self._of_states(states))
+        self._grid("estimates.png", title, states, draw)
 
     def unknown_inputs(self, what: Array) -> None:
         """One axes per unknown input, one line per node."""
+        nodes, inputs = spread(self._ids, LINES), spread(range(what.shape[2]), AXES)
 
         def draw(axes: Any, j: int) -> None:
-            for i in spread(self._ids, LINES):
+            for i in nodes:
                 own = what[self._ids.index(i), :, j]
                 self._own_line(axes, i, own)
             axes.set(title=f"$w_{{{j + 1}}}$")
 
-        self._grid("unknown_inputs.png", "Reconstructed unknown inputs", spread(range(what.shape[2]), AXES), draw)
+        some = _some(inputs, what.shape[2], "unknown inputs")
+        title = self._title("Reconstructed unknown inputs", self._of_nodes(nodes), some)
+        self._grid("unknown_inputs.png", title, inputs, draw)
 
     def noise(self) -> None:
         """One axes per node, one line per noise."""
+        nodes = spread(sorted(self._trace.vhat), AXES)
 
         def draw(axes: Any, i: int) -> None:
-            for j in spread(range(self._trace.vhat[i].shape[1]), LINES):
+            count = self._trace.vhat[i].shape[1]
+            noises = spread(range(count), LINES)
+            for j in noises:
                 self._line(axes, self._trace.vhat[i][:, j], lw=0.9, label=f"$v_{{{j + 1}}}$")
             self._shade(axes, i)
-            axes.set(title=f"node {i}", ylabel=rf"$\hat v_{{{i}}}$")
+            some = _some(noises, count, "noises")
+            axes.set(title=f"node {i}{some and f' ({some})'}", ylabel=rf"$\hat v_{{{i}}}$")
 
-        self._grid("noise.png", "Reconstructed measurement noise", spread(sorted(self._trace.vhat), AXES), draw)
+        some = _some(nodes, len(self._trace.vhat), "nodes")
+        self._grid("noise.png", self._title("Reconstructed measurement noise", some), nodes, draw)
+
+    def _of_nodes(self, shown: Sequence[int]) -> str:
+        return _some(shown, len(self._ids), "nodes")
+
+    def _of_states(self, shown: Sequence[int]) -> str:
+        return _some(shown, len(self._states), "states")
+
+    def _title(self, what: str, *parts: str) -> str:
+        """What a figure shows, of which run, and how much of it where that is not all."""
+        said = ", ".join(filter(None, parts))
+        return f"{what}: {self._name}" + (f"\n({said})" if said else "")
 
     def _grid(
         self, file: str, title: str, items: Sequence[int], draw: Callable[[Any, int], None], *, share: bool = False
@@ -154,9 +180,9 @@ class _Drawing:
         named = dict(zip(shown[0][1], shown[0][0], strict=True))  # one entry of each name
         named.pop("flagged", None)
         shaded = [dict(zip(names, handles, strict=True)) for handles, names in shown if "flagged" in names]
-        named |= {"flagged": shaded[0]["flagged"]} if shaded else {}
+        named |= {"flagged": _anybody_s(shaded[0]["flagged"])} if shaded else {}
         figure.legend(named.values(), named.keys(), loc="outside right upper", frameon=False)
-        figure.suptitle(f"{title}: {self._name}")
+        figure.suptitle(title)
         path = self._folder / file
         figure.savefig(path, dpi=DPI)
         self.written.append(path)
@@ -190,7 +216,23 @@ class _Drawing:
         thinned = Decimator(_stride(len(values)))
         parts = (thinned.push(np.arange(len(values)), values), thinned.drain())
         steps, kept = (np.concatenate(column) for column in zip(*parts, strict=True))
+        if len(values) < FEW:
+            style |= {"marker": "o", "markersize": style["lw"] + 3}
         axes.plot(self._time[steps], kept, **style)
+
+
+def _some(shown: Sequence[int], count: int, what: str) -> str:
+    """How many of them are shown; nothing where all are."""
+    return f"{len(shown)} of {count} {what}" if len(shown) < count else ""
+
+
+def _anybody_s(flagged: Any) -> Any:
+    """The legend's handle of flagged steps: grey instead of the colour of the one node whose line it is."""
+    from matplotlib.lines import Line2D
+
+    if not isinstance(flagged, Line2D):  # a shade in a node's own axes has a colour of its own
+        return flagged
+    return Line2D([], [], color=GREY, lw=flagged.get_linewidth(), alpha=flagged.get_alpha())
 
 
 def _stride(steps: int) -> int:

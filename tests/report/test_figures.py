@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.colors import to_hex
 
 from duio_mesh.report import figures as module
 from duio_mesh.report.figures import figures
@@ -137,3 +138,43 @@ def test_drawing_leaves_the_program_s_matplotlib_alone(tmp_path: Path) -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"
+
+
+def test_flagged_is_grey_in_the_legend_of_axes_that_nodes_share(tmp_path: Path, drawn: dict[str, Any]) -> None:
+    """It is no node's colour: every node has its own under its line."""
+    flagged = np.zeros((3, 40), dtype=bool)
+    flagged[1, 5:9] = True
+    figures(tmp_path, SCENARIO, make_trace(flagged=flagged))
+    for name, colour in {
+        "error_norms.png": module.GREY,
+        "estimates.png": module.GREY,
+        "errors.png": module.SHADE,
+    }.items():
+        legend = drawn[name].legends[0]
+        at = [text.get_text() for text in legend.get_texts()].index("flagged")
+        handle = legend.legend_handles[at]
+        shown = handle.get_color() if name != "errors.png" else handle.get_facecolor()
+        assert to_hex(shown) == to_hex(colour), name
+
+
+@pytest.mark.parametrize(("K", "marker"), [(1, "o"), (2, "o"), (3, "None")])
+def test_a_run_of_next_to_no_steps_has_markers(K: int, marker: str, tmp_path: Path, drawn: dict[str, Any]) -> None:
+    figures(tmp_path, SCENARIO, make_trace(K=K))
+    for name, figure in drawn.items():
+        assert {line.get_marker() for axes in figure.axes for line in lines(axes)} == {marker}, name
+
+
+def test_a_title_says_what_is_shown_only_in_part(tmp_path: Path, drawn: dict[str, Any]) -> None:
+    what = np.zeros((20, 5, 13))
+    figures(tmp_path, SCENARIO, make_trace(20, 5, 24, what=what, vhat={i: np.zeros((5, 17)) for i in range(1, 14)}))
+    assert {name: figure.get_suptitle().partition("\n")[2] for name, figure in drawn.items()} == {
+        "errors.png": "(12 of 20 nodes, 16 of 24 states)",
+        "error_norms.png": "",
+        "states.png": "(16 of 24 states)",
+        "estimates.png": "(16 of 20 nodes, 12 of 24 states)",
+        "unknown_inputs.png": "(16 of 20 nodes, 12 of 13 unknown inputs)",
+        "noise.png": "(12 of 13 nodes)",
+    }
+    assert drawn["noise.png"].axes[0].get_title() == "node 1 (16 of 17 noises)"
+    figures(tmp_path, SCENARIO, make_trace())
+    assert drawn["errors.png"].get_suptitle() == "Estimation errors: synthetic"
