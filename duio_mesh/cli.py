@@ -160,7 +160,7 @@ def _main(args: argparse.Namespace) -> int:
             if args.out:
                 from duio_mesh.deploy.stored import write_design
 
-                print(f"design     {write_design(design, args.out)}")
+                console.written("design", write_design(design, args.out))
             return CONVERGED
         result = _run(design, args, supervisor)
     console.result(design, result, live=args.live)

@@ -9,6 +9,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from pathlib import Path
 from typing import Any
 
 from rich.cells import cell_len
@@ -292,6 +293,11 @@ def _side_by_side(corner: str, names: list[str], columns: Mapping[str, list[str]
 def _column(name: str, *, right: bool = False) -> Column:
     """A column whose cells are broken where they do not fit, never cut."""
     return Column(name, justify="right" if right else "left", overflow="fold")
+
+
+def written(what: str, path: Path) -> None:
+    """Where something is now."""
+    _out.say(f"{what:10} {path}")
 
 
 def plan(design: Design, *, record: bool) -> None:

@@ -8,6 +8,7 @@ from duio_mesh.diagnosis import Process
 from duio_mesh.errors import RunError
 from duio_mesh.supervisor import Supervisor
 
+READY = 1.0  # seconds in which those that are just about to say that they are ready may do so
 TRIES = 3  # processes in a row that may be lost before one of them is back in step
 
 
@@ -24,7 +25,7 @@ class Recovery:
         if not lost.who.startswith("node-"):
             return False
         supervisor, who = self._supervisor, lost.who
-        if self._policy == "degrade" and not all(p.said for p in supervisor.processes.values() if p.essential):
+        if self._policy == "degrade" and not supervisor.all_ready(READY):
             # the others would look for it until the start's time is over
             lost.warnings.append("it was lost before everybody was there, and a run begins with everybody")
             return False

@@ -147,6 +147,12 @@ class Supervisor(Account):
         """Whether plant or gateway have sent their last sample and seen every node finish."""
         return any(self.processes[who].code == 0 for who in ("plant", "gateway") if who in self.processes)
 
+    def all_ready(self, timeout: float) -> bool:
+        """Whether everybody but the recorder has said that it is ready, or does so within ``timeout`` seconds."""
+        needed = [p for p in self.processes.values() if p.essential]
+        self._until(lambda: all(p.said for p in needed), timeout)
+        return all(p.said for p in needed)
+
     def _end_the_late(self) -> None:
         """The plant is done, so whoever is not back in step has come too late."""
         for p in self._essential():

@@ -53,10 +53,10 @@ def test_is_designed_and_converges(order: str) -> None:
 
 
 def test_without_their_neighbours_vehicles_and_machines_do_not_manage() -> None:
-    """The network is needed: each node follows itself only."""
-    for order in ("platoon --vehicles 4", "swing --case 14"):
+    """The network is needed: each node follows itself only, machines at least the slow modes."""
+    for order, more in (("platoon --vehicles 4", ()), ("swing --case 14", ("observer.sigma=0.5",))):
         with pytest.raises(DesignError):
-            synthesise(made(order, "graph.edges=[]"))
+            synthesise(made(order, "graph.edges=[]", *more))
 
 
 def test_rooms_exchange_heat_with_the_rooms_next_to_them_only() -> None:
