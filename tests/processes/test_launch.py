@@ -10,8 +10,10 @@ import pytest
 
 import duio_mesh
 from duio_mesh import cli, launcher
-from duio_mesh.errors import RunError
-from tests.conftest import TOPOLOGIES, wait_for
+from duio_mesh.diagnosis import Process
+from duio_mesh.recovery import Recovery
+from duio_mesh.supervisor import Supervisor
+from tests.conftest import TOPOLOGIES
 from tests.processes.running import Running
 
 pytestmark = pytest.mark.mesh
@@ -35,16 +37,21 @@ def test_a_node_that_somebody_else_asked_to_stop_is_the_cause() -> None:
         assert "run failed: node-2 was asked to stop, by somebody else's SIGTERM; " in run.stderr
 
 
-@pytest.mark.usefixtures("nothing_left")
-def test_a_node_that_is_lost_too_early_to_go_on_without_it_says_so() -> None:
-    with Running("ring.yaml", "--no-record", "--set", "run.on_node_loss=degrade") as run:
-        wait_for(lambda: run.exists("node-2"))
-        if any(e["event"] == "ready" for e in run.said("node-2")):
-            pytest.skip("it was ready already")
-        run.send("node-2", signal.SIGKILL)
-        code = run.end()
-        if code == 3:
-            assert "it was lost before everybody was there, and a run begins with everybody" in run.stderr
+@pytest.mark.parametrize("ready", [True, False])
+def test_a_node_that_is_lost_before_everybody_was_there(ready: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The run goes on without it only if the others do not look for it any more."""
+    monkeypatch.setattr("duio_mesh.recovery.READY", 0.0)
+    with Supervisor() as supervisor:
+        processes = supervisor.processes
+        processes |= {who: Process(who) for who in ("plant", "node-1", "node-2", "recorder")}
+        for who in ("plant", "node-1", "node-2")[: 3 if ready else 2]:
+            processes[who].hear({"event": "ready"}, 0.0)
+        lost = processes["node-1"]
+        lost.hear({"event": "exit", "code": -9}, 0.0)
+        assert Recovery(supervisor, "degrade", lambda who, before: None)(lost) is ready
+        assert lost.there is not ready
+        text = "the others went on without it" if ready else "a run begins with everybody"
+        assert lost.warnings[0].endswith(text)
 
 
 @pytest.mark.usefixtures("nothing_left")
@@ -95,12 +102,8 @@ def test_the_oracle_counts_as_processes_do(name: str, changes: dict[str, object]
         assert mesh.get(counted) == oracle.get(counted), counted
 
 
-def test_a_failed_run_says_what_was_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of those that were stopped, too."""
-    from duio_mesh.diagnosis import Process
-
-    for event in ("failed", "stopped", "done"):
-        process = Process("node-1")
-        process.hear({"event": event, "text": "", "rejected": {"checksum": 2}}, 0.0)
-        assert process.rejected == {"checksum": 2}
-    assert RunError("x", warnings=["y"]).warnings == ("y",)
+@pytest.mark.parametrize("event", ["failed", "stopped", "done"])
+def test_what_a_process_refused_is_known_however_it_ends(event: str) -> None:
+    process = Process("node-1")
+    process.hear({"event": event, "text": "", "rejected": {"checksum": 2}}, 0.0)
+    assert process.rejected == {"checksum": 2}
