@@ -14,7 +14,7 @@ from scipy import linalg
 from duio_mesh import DesignError, load_scenario, simulate, synthesise
 from duio_mesh.geometry.subspace import GeometryError
 from duio_mesh.scenario import model
-from duio_mesh.synthesis import reduced_order, reduced_order_local
+from duio_mesh.synthesis import reduced_order_local, reduced_order_network
 from duio_mesh.synthesis import synthesise as synthesise_aloud
 from duio_mesh.synthesis.reduced_order_local import Model, interval, separate, split
 
@@ -125,7 +125,7 @@ def test_an_automatic_rate_is_halved_until_gains_are_reliable(tmp_path):
 
 
 def test_what_auto_tried_is_said(tmp_path, monkeypatch):
-    monkeypatch.setattr(reduced_order, "_RATES", (3.0, 1.5))
+    monkeypatch.setattr(reduced_order_network, "_RATES", (3.0, 1.5))
     monkeypatch.setattr(reduced_order_local, "stabilise", lambda *_: (_ for _ in ()).throw(GeometryError("no gain")))
     text = (
         r"observer\.rate = 1\.5: .*\(observer\.rate: auto tried 3 halved down to 1\.5\) \(observer\.sigma: auto tried"
