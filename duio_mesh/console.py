@@ -22,6 +22,7 @@ from rich.text import Text
 
 from duio_mesh import launcher
 from duio_mesh.launcher import RunResult
+from duio_mesh.report.description import needed
 from duio_mesh.report.losses import Rest, badness, rest
 from duio_mesh.report.recovery import loss_in_words
 from duio_mesh.report.timeliness import in_words
@@ -209,7 +210,7 @@ def certificate(design: Design) -> None:
     conditions = Table(*map(_column, ("condition", "value", "needed")), Column(no_wrap=True), title="conditions")
     for name, condition in found["conditions"].items():
         mark = Text("ok", "green") if condition["ok"] else Text("no", "red")
-        conditions.add_row(name, _text(condition["value"]), _text(condition["threshold"]), mark)
+        conditions.add_row(name, _text(condition["value"]), needed(condition), mark)
     _out.print(conditions)
     _by_node(found["nodes"])
     plain = {name: value for name, value in found.items() if name not in APART}

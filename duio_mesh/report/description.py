@@ -48,9 +48,15 @@ def describe(scenario: Scenario, certificate: Mapping[str, Any]) -> str:
     return "\n".join(lines) + "\n"
 
 
+def needed(condition: Mapping[str, Any]) -> str:
+    """What a condition of a certificate asks for, in words: a method without numbers to compare has words itself."""
+    threshold = condition.get("threshold", "-")
+    return f"{condition['relation']} {threshold:g}" if "relation" in condition else str(threshold)
+
+
 def _conditions(conditions: Mapping[str, Any]) -> list[str]:
     head = ["condition", "value", "needed", "holds"]
-    return _table(head, [[name, c.get("value"), c.get("threshold"), c.get("ok")] for name, c in conditions.items()])
+    return _table(head, [[name, c.get("value"), needed(c), c.get("ok")] for name, c in conditions.items()])
 
 
 def _nodes(nodes: Mapping[Any, Mapping[str, Any]]) -> list[str]:

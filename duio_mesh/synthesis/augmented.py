@@ -30,7 +30,7 @@ from duio_mesh.synthesis.augmented_error import (
 from duio_mesh.synthesis.augmented_existence import View, check
 from duio_mesh.synthesis.augmented_gains import find_gains, given_H
 from duio_mesh.synthesis.augmented_options import BraschPearson, Options
-from duio_mesh.synthesis.design import Design, Progress, node_spec, plant_spec
+from duio_mesh.synthesis.design import Design, Progress, above, below, node_spec, plant_spec
 from duio_mesh.synthesis.noise import noise_covariance
 from duio_mesh.synthesis.sampled import error_system
 from duio_mesh.synthesis.uio import decouple_node
@@ -152,11 +152,11 @@ def _conditions(
 ) -> dict[str, dict[str, Any]]:
     """What had to hold: margins are singular values relative to 1, so they are comparable between systems."""
     worst = min(margins, key=lambda i: margins[i])
-    found = {f"Lemma 4 (node {worst})": {"value": margins[worst], "threshold": RTOL, "ok": True}}
+    found = {f"Lemma 4 (node {worst})": above(margins[worst], RTOL)}
     for source in sources:
         name = f"Theorem 8 (iv), nodes {', '.join(map(str, source['nodes']))}"
-        found[name] = {"value": min(source["kept"], 1.0), "threshold": RTOL, "ok": True}
-    found["Phi is Schur"] = {"value": radius, "threshold": rate, "ok": radius < rate}
+        found[name] = above(min(source["kept"], 1.0), RTOL)
+    found["Phi is Schur"] = below(radius, rate)
     return found
 
 

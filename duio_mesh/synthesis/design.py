@@ -74,6 +74,16 @@ def flow_control(run: Run, window: int) -> Flow:
     return Flow(window, max(1, window // 4 // run.batch) * run.batch)
 
 
+def below(value: float, threshold: float) -> dict[str, Any]:
+    """A condition of a certificate: value < threshold."""
+    return {"value": value, "relation": "<", "threshold": threshold, "ok": bool(value < threshold)}
+
+
+def above(value: float, threshold: float) -> dict[str, Any]:
+    """A condition of a certificate: value > threshold."""
+    return {"value": value, "relation": ">", "threshold": threshold, "ok": bool(value > threshold)}
+
+
 def plant_spec(scenario: Scenario) -> PlantSpec:
     """The plant process' spec; LQR gain and continuous propagators are computed here.
 

@@ -17,6 +17,7 @@ from duio_mesh.scenario.model import Graph, Scenario
 from duio_mesh.spec import NodeSpec
 from duio_mesh.synthesis.augmented_error import gramians
 from duio_mesh.synthesis.consensus import Coupling
+from duio_mesh.synthesis.design import above, below
 from duio_mesh.synthesis.losses import losses, without
 from duio_mesh.synthesis.noise import noise_covariance
 from duio_mesh.synthesis.sampled import Coupled
@@ -117,7 +118,7 @@ def certificate(scenario: Scenario, network: Network, specs: Mapping[int, NodeSp
         at_most = rho
     conditions = _conditions(network, rho, scenario.options.consensus)
     if contracts and errors.size > DENSE:  # two ways to the same number must agree
-        conditions["what Arnoldi's method finds is below the proven bound"] = _below(rho, at_most * (1 + 1e-6))
+        conditions["what Arnoldi's method finds is below the proven bound"] = below(rho, at_most * (1 + 1e-6))
     if scenario.options.consensus == "robust":
         conditions |= _losses(scenario.graph, specs, say)
     wrong = {name: c for name, c in conditions.items() if not c["ok"]}
@@ -165,15 +166,15 @@ def _conditions(network: Network, rho: float, consensus: str) -> dict[str, dict[
     for name, key in margins.items():
         worst = min(nodes, key=lambda i: nodes[i].uio.margins[key])
         value = nodes[worst].uio.margins[key]
-        found[f"{name} (node {worst})"] = {"value": value, "threshold": RTOL, "ok": value > RTOL}
+        found[f"{name} (node {worst})"] = above(value, RTOL)
     leak = {i: _leak(own) for i, own in nodes.items()}
     worst = max(leak, key=lambda i: leak[i])
-    found[f"(14)-(15), U_i invariant and unseen (node {worst})"] = _below(leak[worst], 1e-7)
+    found[f"(14)-(15), U_i invariant and unseen (node {worst})"] = below(leak[worst], 1e-7)
     worst = max(nodes, key=lambda i: nodes[i].rho)
-    found[f"A_id - K_id C_id is Schur (node {worst})"] = _below(nodes[worst].rho, SCHUR)
+    found[f"A_id - K_id C_id is Schur (node {worst})"] = below(nodes[worst].rho, SCHUR)
     if consensus != "schur":
-        found["(39)-(40), beta_u"] = _below(network.beta, 0.0)
-    found["the error matrix of (31) is Schur"] = _below(rho, SCHUR)
+        found["(39)-(40), beta_u"] = below(network.beta, 0.0)
+    found["the error matrix of (31) is Schur"] = below(rho, SCHUR)
     return found
 
 
@@ -188,11 +189,7 @@ def _losses(graph: Graph, specs: Mapping[int, NodeSpec], say: Say) -> dict[str, 
     if not radii:
         return {}
     worst = max(radii, key=lambda lost: radii[lost])
-    return {f"(31) is Schur with any one link lost ({worst})": _below(radii[worst], SCHUR)}
-
-
-def _below(value: float, threshold: float) -> dict[str, Any]:
-    return {"value": value, "threshold": threshold, "ok": bool(value < threshold)}
+    return {f"(31) is Schur with any one link lost ({worst})": below(radii[worst], SCHUR)}
 
 
 def _leak(own: Local) -> float:

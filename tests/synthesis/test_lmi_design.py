@@ -146,7 +146,7 @@ def test_certificate_is_plain_data_with_every_condition(gain):
     assert json.loads(json.dumps(found, allow_nan=False))["spectral_radius"] < 1
     assert len(found["conditions"]) == 8
     for condition in found["conditions"].values():
-        assert set(condition) == {"value", "threshold", "ok"}
+        assert set(condition) == {"value", "relation", "threshold", "ok"}
         assert condition["ok"] is True
     if gain == {"poles": [0.6, 0.9]}:
         assert found["spectral_radius_detectable"] == pytest.approx(0.9, abs=1e-6)
