@@ -12,6 +12,7 @@ import threading
 from contextlib import suppress
 
 import numpy as np
+import psutil
 import pytest
 
 from tests.conftest import wait_for
@@ -112,6 +113,7 @@ def strike_at(step: int, who: str, number: signal.Signals) -> None:
     with run_with(who, STEPS, "run.deadline=3.0", pause) as run:
         wait_for(lambda: happened(run, "node-1", "pausing"))
         node = run.pid("node-1")
+        wait_for(lambda: psutil.Process(node).status() == psutil.STATUS_STOPPED)  # it says so before it does
         run.send(who, number)
         with suppress(ProcessLookupError):  # nothing is left of a run without a launcher
             os.kill(node, signal.SIGCONT)
