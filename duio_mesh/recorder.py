@@ -101,11 +101,11 @@ def run(spec: RecorderSpec, report: Report) -> None:
 
 def _fits(spec: RecorderSpec, node: int | None, frame: Frame) -> bool:
     """Whether these are whole rows of steps that the run has."""
-    size = spec.n if node is None else spec.sizes[node]
-    if node is not None and frame.r in (ASIDE, MISSING):
-        size = COLUMNS if frame.r == ASIDE else 1
+    if node is not None and frame.r == ASIDE:  # rows of one step
+        return frame.vector.size % COLUMNS == 0 and frame.k < spec.steps
+    size = spec.n if node is None else 1 if frame.r == MISSING else spec.sizes[node]
     count, rest = divmod(frame.vector.size, size)
-    return not rest and frame.k + (1 if size == COLUMNS and frame.r == ASIDE else count) <= spec.steps
+    return not rest and frame.k + count <= spec.steps
 
 
 def _keep(recording: Recording, spec: RecorderSpec, node: int | None, frame: Frame) -> int:
