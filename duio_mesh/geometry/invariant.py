@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from duio_mesh.arrays import Array
 from duio_mesh.geometry.stability import Stability, split_spectrum
-from duio_mesh.geometry.staircase import _unobservable
+from duio_mesh.geometry.staircase import unobservable_with_margin
 from duio_mesh.geometry.subspace import (
     RTOL,
     GeometryError,
@@ -88,7 +88,7 @@ def infimal_unobservability(C: Array, A: Array, W: Array, rtol: float = RTOL) ->
 
 def _infimal_unobservability(C: Array, A: Array, W: Array, rtol: float) -> tuple[Array, Rank]:
     if not W.shape[1]:
-        return _unobservable(unit_rows(C), A, rtol)
+        return unobservable_with_margin(unit_rows(C), A, rtol)
     n, size = A.shape[0], norm(A)
     K, margin = kernel_with_margin(unit_rows(C), rtol, scale=1.0)
     S: Array = np.eye(n)

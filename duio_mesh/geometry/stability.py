@@ -16,6 +16,9 @@ from duio_mesh.geometry.subspace import GeometryError
 # eigenvalues this close (relative to max(1, |lambda|)) are one cluster: a computed double eigenvalue splits by 1.5e-8
 _CLUSTER = 1e-7
 
+SCHUR = 1 - 1e-9
+"""What the spectral radius of a finished design has to stay below: rounding prints an eigenvalue 1 as 1 - 1e-16."""
+
 
 @dataclass(frozen=True)
 class Stability:

@@ -48,7 +48,8 @@ class Decomposition:
         return int(self.U.shape[1])
 
 
-def _unobservable(C: Array, A: Array, rtol: float) -> tuple[Array, Rank]:
+def unobservable_with_margin(C: Array, A: Array, rtol: float) -> tuple[Array, Rank]:
+    """``unobservable_subspace``, and how clear its rank decisions were."""
     C, size = unit_rows(C, rtol), norm(A)
     V, margin = kernel_with_margin(C, rtol, scale=1.0)
     while V.shape[1]:
@@ -93,13 +94,13 @@ def unobservable_subspace(C: Array, A: Array, rtol: float = RTOL) -> Array:
     Raises GeometryError for wrong shapes or values that are not finite.
     """
     C, A = as_pair(C, A)
-    return _unobservable(C, A, rtol)[0]
+    return unobservable_with_margin(C, A, rtol)[0]
 
 
 def observability_decomposition(C: Array, A: Array, rtol: float = RTOL) -> Decomposition:
     """D and U with U the unobservable subspace of (C, A). Arguments and errors as ``unobservable_subspace``."""
     C, A = as_pair(C, A)
-    U, decided = _unobservable(C, A, rtol)
+    U, decided = unobservable_with_margin(C, A, rtol)
     return Decomposition(complement(U), U, np.linalg.eigvals(U.T @ A @ U).astype(np.complex128), decided)
 
 
@@ -110,7 +111,7 @@ def detectability_decomposition(C: Array, A: Array, stability: Stability, rtol: 
     Arguments and errors as ``unobservable_subspace``; also GeometryError when good and bad modes cannot be separated.
     """
     C, A = as_pair(C, A)
-    V, decided = _unobservable(C, A, rtol)
+    V, decided = unobservable_with_margin(C, A, rtol)
     Z, bad, _ = split_spectrum(V.T @ A @ V, stability)
     U = V @ Z
     return Decomposition(complement(U), U, bad, decided._replace(rank=U.shape[1]))

@@ -24,7 +24,7 @@ from duio_mesh.geometry import (
 )
 from duio_mesh.scenario.model import Normal, Scenario
 from duio_mesh.synthesis.admm_options import Options
-from duio_mesh.synthesis.augmented_error import gramians
+from duio_mesh.synthesis.lyapunov import gramians
 from duio_mesh.synthesis.uio import check_quotient
 
 LEAST_CURVATURE = 1e-10

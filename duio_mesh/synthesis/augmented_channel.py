@@ -19,10 +19,11 @@ from scipy import linalg
 
 from duio_mesh.arrays import Array
 from duio_mesh.errors import DesignError
-from duio_mesh.synthesis.augmented_error import Gains, Network, gramians, static_gains
+from duio_mesh.synthesis.augmented_error import Gains, Network, static_gains
 from duio_mesh.synthesis.augmented_existence import Component
 from duio_mesh.synthesis.augmented_h2 import mild_filter
 from duio_mesh.synthesis.design import Progress
+from duio_mesh.synthesis.lyapunov import gramians
 
 Compensator = Callable[[Array, Array, Array], tuple[Array, Array, Array, Array]]
 """(A, B, C) of one component seen from its channel -> (K, Q, R, S): u = K y + Q xi, xi+ = S xi + R y."""

@@ -150,21 +150,6 @@ def _block(i: int, n: int, p: Sequence[int], beta: Sequence[int]) -> tuple[NDArr
     return np.r_[e, n * N + xi], np.r_[innovation, all_p + e, all_p + n * N + xi]
 
 
-def gramians(Phi: Array, W: Array, Q: Array) -> tuple[Array, Array] | None:
-    """X = Phi X Phi' + W and Y = Phi' Y Phi + Q by doubling; None when Phi is not Schur."""
-    X, Y, power = W, Q, Phi
-    for _ in range(45):
-        X = X + power @ X @ power.T
-        Y = Y + power.T @ Y @ power
-        power = power @ power
-        size = np.abs(power).max()
-        if not size < 1e15:
-            return None
-        if size < 1e-10:
-            return X, Y
-    return None
-
-
 class Transient(NamedTuple):
     """How the powers of Phi behave: ||Phi^t||_2."""
 

@@ -19,9 +19,10 @@ from duio_mesh.arrays import Array
 from duio_mesh.errors import DesignError
 from duio_mesh.geometry import observability_decomposition
 from duio_mesh.geometry.stability import spectral_radius
-from duio_mesh.synthesis.augmented_error import ErrorSystem, Gains, Network, gramians
+from duio_mesh.synthesis.augmented_error import ErrorSystem, Gains, Network
 from duio_mesh.synthesis.design import Progress
 from duio_mesh.synthesis.lbfgs import minimise
+from duio_mesh.synthesis.lyapunov import gramians
 
 _BRAVE = 10.0  # at least this transient weight while gamma falls: noise alone may not excite an unstable mode at all
 _STAGES, _PER_STAGE, _LAST = 80, 60, 500

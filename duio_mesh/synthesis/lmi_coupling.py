@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from duio_mesh.errors import DesignError
+from duio_mesh.geometry.stability import SCHUR
 from duio_mesh.scenario.model import Graph, Scenario
 from duio_mesh.synthesis.consensus import Coupling, Undetectable, couple, coupling, pencil_of
 from duio_mesh.synthesis.design import Progress
@@ -19,8 +20,8 @@ from duio_mesh.synthesis.spectral import least_radius
 
 Island = tuple[int, ...]
 
-CLEAR = 1e-9
-"""How far beta_u has to be below 0, and a spectral radius below 1, to be more than rounding."""
+CLEAR = 1 - SCHUR
+"""How far beta_u has to be below 0 to be more than rounding."""
 
 
 def couple_islands(scenario: Scenario, nodes: Mapping[int, Local], progress: Progress) -> Network:
@@ -70,7 +71,7 @@ def _laplacian(graph: Graph, island: Island) -> Any:
 def _schur(island: Island, start: Coupling, say: Say) -> Coupling:
     """A g whose Phi_u is Schur, whatever its norm."""
     g, radius = least_radius(start.pencil, start.g, say)
-    if not radius < 1 - CLEAR:
+    if not radius < SCHUR:
         raise DesignError(
             f"consensus: schur found no stabilising gains for {_who(island)}: the least spectral radius of Phi_u found "
             f"is {radius:.6g} (a search, not a proof that none exist). {_advice(island)}{_exact(island)}."
@@ -88,7 +89,7 @@ def _robust(scenario: Scenario, island: Island, nodes: Mapping[int, Local], say:
     }
     pencils = {name: _pencil(island, nodes, graph) for name, graph in graphs.items()}
     best = minimise_largest_eigenvalue(list(pencils.values()), say)
-    if not best.value < 1 - CLEAR:
+    if not best.value < SCHUR:
         alone = {}
         for name, pencil in pencils.items():
             say(f"{name}, on its own")

@@ -11,21 +11,18 @@ from scipy import linalg
 from duio_mesh.arrays import Array
 from duio_mesh.errors import DesignError
 from duio_mesh.geometry import RTOL, Decomposition
-from duio_mesh.geometry.stability import spectral_radius
+from duio_mesh.geometry.stability import SCHUR, spectral_radius
 from duio_mesh.geometry.subspace import norm
 from duio_mesh.scenario.model import Graph, Scenario
 from duio_mesh.spec import NodeSpec
-from duio_mesh.synthesis.augmented_error import gramians
 from duio_mesh.synthesis.consensus import Coupling
 from duio_mesh.synthesis.design import above, below
 from duio_mesh.synthesis.losses import losses, without
+from duio_mesh.synthesis.lyapunov import gramians
 from duio_mesh.synthesis.noise import noise_covariance
 from duio_mesh.synthesis.sampled import Coupled
 from duio_mesh.synthesis.stacked import DENSE, Say, Stacked, largest_modulus
 from duio_mesh.synthesis.uio import Decoupling
-
-SCHUR = 1 - 1e-9
-"""What a spectral radius has to stay below: rounding prints an eigenvalue 1 as 1 - 1e-16."""
 
 
 class Local(NamedTuple):

@@ -17,6 +17,7 @@ from scipy import linalg
 
 from duio_mesh.arrays import Array
 from duio_mesh.errors import DesignError
+from duio_mesh.geometry.stability import SCHUR
 from duio_mesh.synthesis.absence import Absence
 
 Hold: TypeAlias = Literal["zero_order", "first_order", "quadratic"]
@@ -31,10 +32,6 @@ _INTERPOLATION: dict[Hold, Array] = {
 
 _ENOUGH = 0.95  # of the best decay rate: more coupling than that costs robustness and gains nothing
 _MARGIN = 1.5  # in the step
-
-SCHUR = 1 - 1e-9
-"""What a sampled error's spectral radius has to stay below: rounding prints an eigenvalue 1 as 1 - 1e-16. In continuous
-time it is an abscissa below log(SCHUR) / step."""
 
 
 class HoldOptions(Absence):
@@ -124,7 +121,8 @@ def choose_gain(
     """The coupling gain called ``name``: as wanted, or the smallest whose error decays about as fast as with any.
 
     ``abscissa_at(gain)`` and ``radius_at(gain, step)`` belong to the error system in continuous time and sampled.
-    ``auto`` keeps a distance: its gain is stable at 1.5 times the step h too. Stable means by more than rounding.
+    ``auto`` keeps a distance: its gain is stable at 1.5 times the step h too. Stable means by more than rounding:
+    a radius below SCHUR, in continuous time an abscissa below log(SCHUR) / h.
     Raises DesignError with these numbers when the wanted gain, or every gain tried, is unstable; ``cure`` (words) is
     what helps where no step does.
     """

@@ -11,7 +11,8 @@ from scipy import linalg
 from duio_mesh import load_scenario, simulate, synthesise
 from duio_mesh.geometry.stability import spectral_radius
 from duio_mesh.scenario.model import Noise
-from duio_mesh.synthesis.augmented_error import distance_to_instability, gramians, transient
+from duio_mesh.synthesis.augmented_error import distance_to_instability, transient
+from duio_mesh.synthesis.lyapunov import gramians
 from duio_mesh.synthesis.noise import noise_covariance
 
 TOPOLOGIES = Path(__file__).parents[2] / "topologies"
