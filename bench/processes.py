@@ -1,13 +1,14 @@
-"""The processes of a run as the kernel sees them: who they are and what memory they hold."""
+"""The processes of a run as the kernel sees them: who they are and what memory they hold.
+
+Without pathlib, which interns the parts of every path: looked at often enough, the table of interned strings doubles.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import os
-from pathlib import Path
+from glob import glob
 from typing import NamedTuple
-
-PROC = Path("/proc")
 
 
 class Memory(NamedTuple):
@@ -21,9 +22,9 @@ class Memory(NamedTuple):
 def descendants(pid: int) -> list[int]:
     """All processes below this one."""
     found: list[int] = []
-    for path in PROC.glob(f"{pid}/task/*/children"):
+    for path in glob(f"/proc/{pid}/task/*/children"):
         with contextlib.suppress(FileNotFoundError, ProcessLookupError):  # it has just ended
-            for child in map(int, path.read_text().split()):
+            for child in map(int, _read(path).split()):
                 found += [child, *descendants(child)]
     return found
 
@@ -33,7 +34,7 @@ def family() -> dict[str, int]:
     found = {"launcher": os.getpid()}
     for pid in descendants(os.getpid()):
         with contextlib.suppress(FileNotFoundError, ProcessLookupError):
-            name = (PROC / str(pid) / "cmdline").read_bytes().split(b"\0")[0].decode(errors="replace")
+            name = _read(f"/proc/{pid}/cmdline").split("\0")[0]
             if name.startswith("duio-"):
                 found[name.removeprefix("duio-")] = pid
     return found
@@ -41,7 +42,7 @@ def family() -> dict[str, int]:
 
 def memory(pid: int) -> Memory:
     """Raises FileNotFoundError or ProcessLookupError when the process has ended."""
-    lines = (PROC / str(pid) / "smaps_rollup").read_text().splitlines()
+    lines = _read(f"/proc/{pid}/smaps_rollup").splitlines()
     sizes = {line.split(":")[0]: int(line.split()[1]) / 1024 for line in lines[1:]}
     return Memory(sizes["Rss"], sizes["Anonymous"], sizes["Pss"])
 
@@ -53,3 +54,8 @@ def memories() -> dict[str, Memory]:
         with contextlib.suppress(FileNotFoundError, ProcessLookupError, KeyError):
             found[who] = memory(pid)
     return found
+
+
+def _read(path: str) -> str:
+    with open(path, encoding="utf-8", errors="replace") as f:
+        return f.read()

@@ -133,6 +133,8 @@ class Launch:
         self._design, self._folder, self._supervisor = design, folder, supervisor
         self._record, self._live = record, live
         self._sizes = estimate_sizes(design)
+        # made once: the parts of every new path become interned strings, and ten times a second that adds up
+        self._truth, self._rows = folder.rows("plant"), {i: folder.rows(f"node-{i}") for i in design.nodes}
         self._url = ""  # of the live server, once the recorder has said it
         self._wiring = Wiring(design, folder.keys, record=record, address=address)
 
@@ -180,14 +182,13 @@ class Launch:
         if watcher and recorder and not self._url and (url := recorder.said.get("url")):
             self._url = url
             watcher.started(url)
-        files = {i: self._folder.rows(f"node-{i}") for i in self._sizes}
-        sizes = {i: path.stat().st_size if path.exists() else 0 for i, path in files.items()}
+        sizes = {i: path.stat().st_size if path.exists() else 0 for i, path in self._rows.items()}
         steps = {i: size // (8 * self._sizes[i]) for i, size in sizes.items()}
         errors = {}
         n = self._design.scenario.plant.n
         for i, k in steps.items():
-            x = _row(self._folder.rows("plant"), n, k - 1)
-            estimate = _row(files[i], self._sizes[i], k - 1)
+            x = _row(self._truth, n, k - 1)
+            estimate = _row(self._rows[i], self._sizes[i], k - 1)
             if x is not None and estimate is not None:
                 with np.errstate(over="ignore", invalid="ignore"):  # of an unstable plant
                     errors[i] = float(np.sqrt(np.mean((estimate[:n] - x) ** 2)))
