@@ -28,7 +28,10 @@ OnRound = Callable[[int, float, float], None]
 
 
 class Observer:
-    """The step machine; ``spec.matrices`` holds Abar, PL, PB, T, s0 and, where the launcher found H, Hinv."""
+    """The step machine; ``spec.matrices`` holds Abar, PL, PB, T, s0 and, where the launcher found H, Hinv.
+
+    Where the nodes find H themselves, they do so for states in ``units``, in which its inverse has its digits.
+    """
 
     def __init__(self, spec: NodeSpec) -> None:
         m, n = spec.matrices, spec.n
@@ -48,11 +51,12 @@ class Observer:
         self._block: list[Array] = []  # xi of the samples that the next rounds fuse
         self._fusions: dict[int, Fusion] = {}  # by width: the last block of a run may be shorter
         self._fusion: Fusion | None = None
-        self._Hinv = m.get("Hinv")
+        self._Hinv, self._units = m.get("Hinv"), m.get("units", np.ones(n))
         self._setup, self._ready = FiniteTimeAverage({}, (), 0), spec.options["setup"] == "global"
         if not self._ready:
             self._setup = FiniteTimeAverage(spec.hears, spec.options["eigenvalues"], n * (n + 1) // 2)
-            self._setup.state[:] = (m["T"].T @ m["T"])[np.tril_indices(n)]
+            T = m["T"] * self._units
+            self._setup.state[:] = (T.T @ T)[np.tril_indices(n)]
         self._ahead = self._setup.rounds  # rounds before the fusion's first, in this block
 
     @property
@@ -138,7 +142,7 @@ class Observer:
         H: Array = np.zeros((n, n))
         H[np.tril_indices(n)] = self._options["island_size"] * self._setup.state
         H += np.tril(H, -1).T
-        self._Hinv, self._ready = np.linalg.inv(H).astype(np.float64), True
+        self._Hinv, self._ready = np.linalg.inv(H).astype(np.float64) * np.outer(self._units, self._units), True
         self._begin()
 
     def _tell(self, on_round: OnRound, r: int, x: Array, received: Mapping[int, Array]) -> None:

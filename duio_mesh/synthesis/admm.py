@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from duio_mesh.arrays import Array
 from duio_mesh.errors import DesignError
 from duio_mesh.geometry import stable_radius
 from duio_mesh.scenario.model import Scenario
@@ -27,6 +28,7 @@ from duio_mesh.synthesis.admm_rates import (
     worst_error,
 )
 from duio_mesh.synthesis.design import Design, Progress, node_spec, plant_spec
+from duio_mesh.synthesis.units import even_columns, from_state, in_some_units, in_units, said, to_state
 
 __all__ = ["RADIUS_OF", "Options", "design", "error_left", "error_radius"]
 
@@ -46,8 +48,20 @@ def design(scenario: Scenario, progress: Progress) -> Design:
         raise DesignError(
             f"observer.watch_step: there is no step {options.watch_step} in a run of {scenario.run.steps} steps"
         )
+    if not options.needs_H:  # without H^-1 in front of the gradient the fusion itself depends on the units
+        return _design(scenario, np.ones(scenario.plant.n), progress)
+    return in_some_units(scenario, lambda units: _design(scenario, units, progress), progress)
+
+
+def _design(scenario: Scenario, units: Array, progress: Progress) -> Design:
+    """The design in these units (n,) of the states; the fusion in those in which H has a diagonal of ones."""
+    options: Options = scenario.options
     progress("what each node can follow alone")
-    nodes, stability = local_estimates(scenario, options), stable_radius(options.stable_radius)
+    nodes, stability = local_estimates(in_units(scenario, units), options), stable_radius(options.stable_radius)
+    found = said(units)
+    if found:
+        s = even_columns(np.vstack([local.T for local in nodes.values()]))
+        nodes, units = {i: local._replace(T=local.T * s) for i, local in nodes.items()}, units * s
     islands: dict[int, Island] = {}
     described = []
     for ids in scenario.graph.islands():
@@ -59,11 +73,12 @@ def design(scenario: Scenario, progress: Progress) -> Design:
             progress(f"fusion of {len(at)} nodes from {at[0]}: {what}")
 
         radius = _converges(island, options, say)
-        gains = noise_gain((nodes[i] for i in ids), fused_maps(island, options))
+        gains = units * noise_gain((nodes[i] for i in ids), fused_maps(island, options))
         described.append(island_facts(island, options, eigenvalues, radius, gains, say))
         islands |= dict.fromkeys(ids, island)
-    specs = {i: _spec(scenario, i, local, islands[i]) for i, local in nodes.items()}
-    return Design(scenario, plant_spec(scenario), specs, _certificate(options, nodes, islands, described))
+    specs = {i: _spec(scenario, i, local, islands[i], units) for i, local in nodes.items()}
+    certificate = _certificate(options, nodes, islands, described) | found
+    return Design(scenario, plant_spec(scenario), specs, certificate)
 
 
 def island_of(scenario: Scenario, ids: tuple[int, ...], nodes: Mapping[int, Local]) -> Island:
@@ -98,16 +113,22 @@ def _converges(island: Island, options: Options, say: Progress) -> float:
     return radius
 
 
-def _spec(scenario: Scenario, i: int, local: Local, island: Island) -> NodeSpec:
-    """Its own matrices, H^-1 if the launcher is to provide it, and scalars."""
+def _spec(scenario: Scenario, i: int, local: Local, island: Island, units: Array) -> NodeSpec:
+    """Its own matrices, H^-1 if the launcher is to provide it, and scalars.
+
+    ``units``: of the states in T and H. What the node fuses is in the file's: with H^-1 in front of the gradient every
+    fusion is the same iteration in all units.
+    """
     options: Options = scenario.options
     P, L = local.filter.P, local.filter.L
-    matrices = {"Abar": local.filter.Abar, "PL": P @ L, "PB": local.PB, "T": local.T, "s0": local.s0}
+    matrices = {"Abar": local.filter.Abar, "PL": P @ L, "PB": local.PB, "T": from_state(local.T, units), "s0": local.s0}
     given: dict[str, Any] = {"fusion": options.fusion, "setup": options.setup}
     if options.watch_step is not None:
         given["watch_step"] = options.watch_step
-    if options.needs_H and options.setup == "global":
-        matrices["Hinv"] = island.inverse
+    if options.setup == "distributed":
+        matrices["units"] = units
+    elif options.needs_H:
+        matrices["Hinv"] = to_state(island.inverse, units) * units
     if options.fusion == "admm":
         given |= {"gamma": options.gamma, "nu": options.nu, "alpha_factor": options.alpha_factor}
     elif options.fusion == "relaxed":

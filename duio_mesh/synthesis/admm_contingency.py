@@ -10,6 +10,7 @@ from duio_mesh.scenario.model import Graph
 from duio_mesh.synthesis.admm_options import Options
 from duio_mesh.synthesis.admm_rates import Island, admm_matrix, relaxed_matrix, spectrum
 from duio_mesh.synthesis.design import Design
+from duio_mesh.synthesis.units import even_columns
 
 RADIUS_OF = "fusion, per exchange (0: exact after its rounds; none: it ends in something else than the state)"
 
@@ -24,6 +25,9 @@ def error_radius(design: Design, graph: Graph) -> float:
     designed = design.scenario.graph
     home = next(ids for ids in designed.islands() if graph.ids[0] in ids)
     T = {i: design.nodes[i].matrices["T"] for i in home}
+    if options.needs_H:  # then the states' units change nothing but the digits of H^-1
+        s = even_columns(np.vstack(list(T.values())))
+        T = {i: part * s for i, part in T.items()}
     H = sum((T[i].T @ T[i] for i in home), np.zeros_like(design.scenario.plant.A))
     left = Island(graph.ids, tuple(T[i] for i in graph.ids), graph.laplacian(), H, np.asarray(np.linalg.inv(H)))
     degrees = np.array([sum(designed.hears(i).values()) for i in graph.ids])

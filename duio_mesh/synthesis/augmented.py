@@ -34,6 +34,7 @@ from duio_mesh.synthesis.design import Design, Progress, above, below, node_spec
 from duio_mesh.synthesis.noise import noise_covariance
 from duio_mesh.synthesis.sampled import error_system
 from duio_mesh.synthesis.uio import decouple_node
+from duio_mesh.synthesis.units import from_state, in_some_units, in_units, said, to_state
 
 __all__ = ["RADIUS_OF", "Options", "design", "error_radius"]
 
@@ -57,40 +58,49 @@ def design(scenario: Scenario, progress: Progress) -> Design:
     Raises DesignError when the plant is not discrete, a condition fails (the message names nodes, eigenvalue and
     direction), given matrices have the wrong shape, or the gains miss the wanted decay rate, spectrum or peak.
     """
-    options: Options = scenario.options
     if scenario.plant.time != "discrete":
         raise DesignError("augmented needs a discrete plant (time: discrete); its observers are difference equations")
+    if scenario.options.written:
+        return _design(scenario, np.ones(scenario.plant.n), progress)
+    return in_some_units(scenario, lambda s: _design(scenario, s, progress), progress)
+
+
+def _design(scenario: Scenario, s: Array, progress: Progress) -> Design:
+    """The design in the units s (n,) of the states."""
+    options: Options = scenario.options
+    even = in_units(scenario, s)
     progress("existence conditions")
-    network, views, margins = _network(scenario, options)
+    network, views, margins = _network(even, options)
     stability = stable_radius(min(options.rate, 1 - 1e-9))
     rows = len(network.sensors) * network.n * (1 + options.delay)
     progress(f"existence conditions of {len(network.sensors)} nodes")
-    sources = check(scenario.graph, views, scenario.plant.A, stability)
+    sources = check(scenario.graph, views, network.A, stability)
     if rows > LARGEST:
         raise DesignError(
             f"augmented: gains exist (Theorem 8 holds), but the error matrix (12) has {rows} rows and is dense; from "
             f"{LARGEST} on a design takes hours. method: lmi (coupling gains by products with blocks) and "
             "method: admm handle thousands; or use fewer nodes"
         )
-    found = find_gains(scenario, network, options, progress)
+    found = find_gains(even, network, options, progress)
     gains = found.gains
     progress(f"certificate: eigenvalues, powers and distance to instability of {rows} rows")
-    figures = _figures(network, gains)
+    figures = _figures(network, gains, s)
     _refuse(figures, options)
     certificate = {
         "conditions": _conditions(margins, sources, figures.radius, options.rate),
-        "nodes": _nodes(scenario, views, margins, stability, gains, figures.rms),
+        "nodes": _nodes(even, views, margins, stability, gains, figures.rms),
         "spectral_radius": figures.radius,
         "peak": _plain(figures.powers.peak),
         "steps_to_1e-3": figures.powers.steps,
         "distance_to_instability": figures.distance,
         "gains": found.method,
         "delay": options.delay,
+        **said(s),
     }
     if found.note:
         certificate["gains_note"] = found.note
     specs = {
-        i: _spec(scenario, i, network.A, sensor, own, options.delay)
+        i: _spec(even, i, network.A, sensor, own, s)
         for i, sensor, own in zip(scenario.nodes, network.sensors, gains, strict=True)
     }
     return Design(scenario, plant_spec(scenario), specs, certificate)
@@ -117,11 +127,11 @@ def _network(scenario: Scenario, options: Options) -> tuple[Network, dict[int, V
     return Network(scenario.plant.A, tuple(sensors), scenario.graph.laplacian(), options.delay), views, margins
 
 
-def _figures(network: Network, gains: Sequence[Gains]) -> Figures:
+def _figures(network: Network, gains: Sequence[Gains], s: Array) -> Figures:
     system = ErrorSystem(network, [len(g.S) for g in gains])
     Theta = system.theta(gains)
     Phi = system.matrix(Theta)
-    return Figures(spectral_radius(Phi), transient(Phi), distance_to_instability(Phi), system.predicted_rms(Theta))
+    return Figures(spectral_radius(Phi), transient(Phi), distance_to_instability(Phi), system.predicted_rms(Theta, s))
 
 
 def _refuse(figures: Figures, options: Options) -> None:
@@ -189,10 +199,12 @@ def _plain(value: float) -> float | None:
     return value if np.isfinite(value) else None
 
 
-def _spec(scenario: Scenario, i: int, A: Array, sensor: Sensor, gains: Gains, delay: int) -> NodeSpec:
-    """(9): N = P A - F C, L = F + N H, M = P B_i."""
+def _spec(even: Scenario, i: int, A: Array, sensor: Sensor, gains: Gains, s: Array) -> NodeSpec:
+    """(9): N = P A - F C, L = F + N H, M = P B_i, from the units s of the states to the file's."""
     C, P, H, _ = sensor
     F, K, Q, R, S = gains
     N = P @ A - F @ C
-    matrices = {"N": N, "M": P @ scenario.known(i), "L": F + N @ H, "H": H, "K": K, "Q": Q, "R": R, "S": S}
-    return node_spec(scenario, i, matrices, {"delay": delay})
+    to = {"N": N, "M": P @ even.known(i), "L": F + N @ H, "H": H, "K": K, "Q": Q}
+    M = {name: to_state(matrix, s) for name, matrix in to.items()} | {"R": R, "S": S}
+    matrices = M | {name: from_state(M[name], s) for name in ("N", "K", "R")}
+    return node_spec(even, i, matrices, {"delay": even.options.delay})

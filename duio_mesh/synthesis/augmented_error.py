@@ -131,15 +131,18 @@ class ErrorSystem:
         Gamma[self.rows] += Theta[:, : self.outputs]
         return Gamma
 
-    def predicted_rms(self, Theta: Array) -> Array:
-        """(N,) stationary RMS error per state of each node under the noise V; infinite unless Phi is Schur."""
+    def predicted_rms(self, Theta: Array, units: Array | float = 1.0) -> Array:
+        """(N,) stationary RMS error per state of each node under the noise V; infinite unless Phi is Schur.
+
+        ``units`` (n,): of the states.
+        """
         Phi = self.matrix(Theta)
         N = len(self._blocks)
         if spectral_radius(Phi) >= 1:
             return np.full(N, np.inf)
         Gamma = self.noise_input(Phi, Theta)
         X = linalg.solve_discrete_lyapunov(Phi, Gamma @ self.V @ Gamma.T) + self.H @ self.V @ self.H.T
-        return np.asarray(np.sqrt(np.diag(X)[: self.errors].reshape(N, -1).mean(axis=1)))
+        return np.asarray(np.sqrt((units**2 * np.diag(X)[: self.errors].reshape(N, -1)).mean(axis=1)))
 
 
 def _block(i: int, n: int, p: Sequence[int], beta: Sequence[int]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

@@ -106,3 +106,9 @@ class Options(Absence):
             return _DEFAULTS[self.gains]
         found: H2 | BraschPearson | Channel | tuple[GivenNode, ...] = getattr(self.gains, self.name)
         return found
+
+    @property
+    def written(self) -> bool:
+        """Whether the file holds gains, which are in its units."""
+        chosen = self.chosen()
+        return isinstance(chosen, tuple) or (isinstance(chosen, Channel) and bool(chosen.fixed))

@@ -34,6 +34,7 @@ from duio_mesh.synthesis.sampled import (
     sampled,
 )
 from duio_mesh.synthesis.uio import check_quotient
+from duio_mesh.synthesis.units import from_state, in_some_units, in_units, said, to_state
 
 RADIUS_OF = "sampled error system, per tick; the larger of two: sign term saturated, and around zero"
 
@@ -64,18 +65,23 @@ def design(scenario: Scenario, progress: Progress) -> Design:
     fails for a node on its own, Assumption 3 fails on an island of the graph, or the error system is unstable, in
     continuous time or at this step.
     """
+    if scenario.plant.time != "continuous":
+        raise DesignError("geometric needs a continuous plant (time: continuous, and step: under run)")
+    if scenario.graph.directed:
+        raise DesignError("geometric needs an undirected graph (edges, not arcs): seed 003, Assumption 1")
+    return in_some_units(scenario, lambda s: _design(scenario, s, progress), progress)
+
+
+def _design(scenario: Scenario, s: Array, progress: Progress) -> Design:
+    """The design in the units s (n,) of the states."""
     options: Options = scenario.options
     plant, graph = scenario.plant, scenario.graph
-    if plant.time != "continuous":
-        raise DesignError("geometric needs a continuous plant (time: continuous, and step: under run)")
-    if graph.directed:
-        raise DesignError("geometric needs an undirected graph (edges, not arcs): seed 003, Assumption 1")
-    nodes = {}
-    for i, node in scenario.nodes.items():
+    even, nodes = in_units(scenario, s), {}
+    for i, node in even.nodes.items():
         progress(f"node {i}: subspaces and local gains")
-        args = node.C, plant.A, scenario.known(i), scenario.unknown(i)
+        args = node.C, even.plant.A, even.known(i), even.unknown(i)
         nodes[i] = local_uio(*args, options.poles, options.kappa, f"node {i}")
-        check_quotient(nodes[i].structure, scenario, i)
+        check_quotient(nodes[i].structure, even, i)
     conditions = _conditions(scenario, nodes)
     progress("choosing the coupling")
     L, h = graph.laplacian(), plant.step
@@ -94,7 +100,7 @@ def design(scenario: Scenario, progress: Progress) -> Design:
         )
 
     chi = choose_gain("chi", options.chi, growth, rho, h, L, _CURE)
-    bounds = bounds_21(scenario, nodes)
+    bounds = bounds_21(even, nodes)
     needed = bounds["gamma_needed"]
     if needed is not None:
         enough = options.gamma >= needed
@@ -107,10 +113,11 @@ def design(scenario: Scenario, progress: Progress) -> Design:
         "chi": chi,
         "gamma": options.gamma,
         **bounds,
+        **said(s),
         "step": h,
         "largest_step": largest_step(lambda at: rho(chi, at), h),
     }
-    specs = {i: _spec(scenario, i, node, steps[i], chi) for i, node in nodes.items()}
+    specs = {i: _spec(scenario, i, node, steps[i], chi, s) for i, node in nodes.items()}
     return Design(scenario, plant_spec(scenario), specs, certificate)
 
 
@@ -236,10 +243,14 @@ def _facts(node: LocalUio) -> dict[str, Any]:
     }
 
 
-def _spec(scenario: Scenario, i: int, node: LocalUio, step: Step, chi: float) -> NodeSpec:
-    """What a tick needs: z = Phi z + Gamma history + K push, x-hat = X z + F y, and the coupling's gains."""
+def _spec(scenario: Scenario, i: int, node: LocalUio, step: Step, chi: float, s: Array) -> NodeSpec:
+    """What a tick needs: z = Phi z + Gamma history + K push, x-hat = X z + F y, and the coupling's gains.
+
+    ``s``: the units of the states that the node was designed in; x-hat and the neighbours' are in the file's.
+    """
     options: Options = scenario.options
     gamma = options.gamma if node.group == "N2" else 0.0
     width = _width(scenario, options, i, scenario.plant.step) if gamma else 0.0
-    matrices = {"Phi": step.Phi, "Gamma": step.Gamma, "K": step.K, "X": node.X, "F": node.F, "R": node.R}
+    X, F, R = to_state(node.X, s), to_state(node.F, s), from_state(node.R, s)
+    matrices = {"Phi": step.Phi, "Gamma": step.Gamma, "K": step.K, "X": X, "F": F, "R": R}
     return node_spec(scenario, i, matrices, {"chi": chi, "gamma": gamma, "width": width})

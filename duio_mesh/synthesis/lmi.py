@@ -5,11 +5,13 @@ Every gain is designed here from the whole scenario; what a node gets is its own
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
 
+from duio_mesh.arrays import Array
 from duio_mesh.errors import DesignError
 from duio_mesh.geometry import (
     RTOL,
@@ -29,6 +31,7 @@ from duio_mesh.synthesis.lmi_network import Local, Network, certificate, errors_
 from duio_mesh.synthesis.local_gain import Subsystem, h2_gain, hinf_gain, placed_gain, worst_gain
 from duio_mesh.synthesis.noise import noise_covariance
 from duio_mesh.synthesis.uio import decouple_node
+from duio_mesh.synthesis.units import from_state, in_some_units, in_units, said, to_state
 
 __all__ = ["RADIUS_OF", "Options", "design", "error_radius"]
 
@@ -69,15 +72,20 @@ def design(scenario: Scenario, progress: Progress) -> Design:
     """
     if scenario.plant.time != "discrete":
         raise DesignError("lmi needs a discrete plant (time: discrete); its observers are difference equations")
-    nodes = {}
-    for i in scenario.nodes:
+    return in_some_units(scenario, lambda s: _design(scenario, s, progress), progress)
+
+
+def _design(scenario: Scenario, s: Array, progress: Progress) -> Design:
+    """The design in the units s (n,) of the states."""
+    even, nodes = in_units(scenario, s), {}
+    for i in even.nodes:
         progress(f"decoupling, decomposition and local gain of node {i}")
-        nodes[i] = _local(scenario, i)
-    network = couple_islands(scenario, nodes, progress)
+        nodes[i] = _local(even, i)
+    network = couple_islands(even, nodes, progress)
     progress("certificate")
-    specs = {i: _spec(scenario, i, network) for i in nodes}
-    promises = certificate(scenario, network, specs, lambda what: progress(f"certificate: {what}"))
-    return Design(scenario, plant_spec(scenario), specs, promises)
+    specs = {i: _spec(even, i, network) for i in nodes}
+    promises = certificate(even, network, specs, lambda what: progress(f"certificate: {what}"), s)
+    return Design(scenario, plant_spec(scenario), {i: _back(spec, s) for i, spec in specs.items()}, promises | said(s))
 
 
 def error_radius(design: Design, graph: Graph) -> float:
@@ -135,3 +143,9 @@ def _spec(scenario: Scenario, i: int, network: Network) -> NodeSpec:
         "G": network.g[i] * U @ U.T,
     }
     return node_spec(scenario, i, matrices)
+
+
+def _back(spec: NodeSpec, s: Array) -> NodeSpec:
+    """The spec of a node that was designed in the units s, in the file's."""
+    M = {name: to_state(matrix, s) for name, matrix in spec.matrices.items()}
+    return replace(spec, matrices=M | {name: from_state(M[name], s) for name in ("N", "G")})

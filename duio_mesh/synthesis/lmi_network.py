@@ -61,9 +61,9 @@ def errors_of(specs: Mapping[int, NodeSpec], graph: Graph) -> Stacked:
     return Stacked(blocks, graph.laplacian())
 
 
-def predicted_rms(scenario: Scenario, network: Network, errors: Stacked, say: Say) -> list[float | None]:
+def predicted_rms(scenario: Scenario, network: Network, errors: Stacked, say: Say, units: Array) -> list[float | None]:
     """Stationary RMS error per state of each node under the white noise of the file; None where it takes too long, or
-    where the powers of the error matrix grow beyond all digits before they decay.
+    where the powers of the error matrix grow beyond all digits before they decay. ``units`` (n,): of the states.
 
     (31) is e(k+1) = Phi e(k) + K v(k) - E v(k+1). With s = e + E v the noise enters once, s(k+1) = Phi s(k) +
     (K - Phi E) v(k), and cov e = cov s + E V E', because s(k) does not depend on v(k).
@@ -82,8 +82,8 @@ def predicted_rms(scenario: Scenario, network: Network, errors: Stacked, say: Sa
         found = errors.variances(entry, say)
     if found is None:
         return [None for _ in nodes]
-    variances = np.maximum(found, 0)
-    return [float(np.sqrt(part.mean())) for part in np.split(variances + np.sum(E**2, axis=1), len(network.nodes))]
+    variances = np.maximum(found, 0) + np.sum(E**2, axis=1)
+    return [float(np.sqrt((units**2 * part).mean())) for part in np.split(variances, len(network.nodes))]
 
 
 def _root(V: Array) -> Array:
@@ -92,8 +92,10 @@ def _root(V: Array) -> Array:
     return np.asarray(vectors * np.sqrt(np.maximum(values, 0)))
 
 
-def certificate(scenario: Scenario, network: Network, specs: Mapping[int, NodeSpec], say: Say) -> dict[str, Any]:
-    """Plain data about the network on the scenario's graph.
+def certificate(
+    scenario: Scenario, network: Network, specs: Mapping[int, NodeSpec], say: Say, units: Array
+) -> dict[str, Any]:
+    """Plain data about the network on the scenario's graph; its states are in these ``units`` (n,) of the file's.
 
     Up to stacked.DENSE rows the spectral radius is that of all eigenvalues of (31). Beyond, it is an eigenvalue that
     Arnoldi's method finds, and ``spectral_radius_at_most`` is proven: by (14)-(15) the eigenvalues of (31) are those of
@@ -124,7 +126,7 @@ def certificate(scenario: Scenario, network: Network, specs: Mapping[int, NodeSp
         raise DesignError(f"the design does not hold what it should: {'; '.join(failed)}")
     return {
         "conditions": conditions,
-        "nodes": _nodes(network, predicted_rms(scenario, network, errors, say)),
+        "nodes": _nodes(network, predicted_rms(scenario, network, errors, say, units)),
         "spectral_radius": rho,
         "spectral_radius_at_most": at_most,
         "spectral_radius_detectable": detectable,

@@ -23,6 +23,7 @@ from duio_mesh.synthesis.reduced_order_local import WORST_CONDITION, Model, Sepa
 from duio_mesh.synthesis.reduced_order_network import Node, choose
 from duio_mesh.synthesis.reduced_order_options import Options, bounds_of
 from duio_mesh.synthesis.sampled import Coupled, Step, error_system, largest_step, modes
+from duio_mesh.synthesis.units import from_state, in_some_units, in_units, said, to_state
 
 __all__ = ["RADIUS_OF", "Options", "design", "error_radius"]
 
@@ -37,15 +38,21 @@ def design(scenario: Scenario, progress: Progress) -> Design:
     help, the coupling cannot reach a direction that no node sees (sufficient condition), or the coupling is unstable at
     this step.
     """
-    D, unknown = _unknown_input(scenario)
+    return in_some_units(scenario, lambda units: _design(scenario, units, progress), progress)
+
+
+def _design(scenario: Scenario, units: Array, progress: Progress) -> Design:
+    """The design in these units (n,) of the states."""
+    even = in_units(scenario, units)
+    D, unknown = _unknown_input(even)
     bounds_of(scenario.options, D.shape[1])
-    plant, separated = scenario.plant, {}
-    for i, node in scenario.nodes.items():
+    plant, separated = even.plant, {}
+    for i, node in even.nodes.items():
         progress(f"node {i}: removing noise and unknown input")
-        model = Model(plant.A, scenario.known(i), D, node.C, node.noise.channel)
+        model = Model(plant.A, even.known(i), D, node.C, node.noise.channel)
         separated[i] = separate(model, f"node {i}", unknown)
-    _jointly_detectable(scenario, D, separated, unknown)
-    chosen = choose(scenario, separated, progress)
+    _jointly_detectable(even, D, separated, unknown)
+    chosen = choose(even, separated, progress)
     network, steps, c = chosen
     certificate = {
         "conditions": _conditions(network.nodes, network.spread),
@@ -56,10 +63,11 @@ def design(scenario: Scenario, progress: Progress) -> Design:
         "sigma": network.sigma,
         "rate": network.rate,
         "c_bound_13": network.bound,
+        **said(units),
         "step": plant.step,
         "largest_step": largest_step(chosen.radius, plant.step),
     }
-    specs = {i: _spec(scenario, i, node, steps[i], c) for i, node in network.nodes.items()}
+    specs = {i: _spec(scenario, i, node, steps[i], c, units) for i, node in network.nodes.items()}
     return Design(scenario, plant_spec(scenario), specs, certificate)
 
 
@@ -140,13 +148,17 @@ def _facts(node: Node) -> dict[str, Any]:
     }
 
 
-def _spec(scenario: Scenario, i: int, node: Node, step: Step, c: float) -> NodeSpec:
-    """Everything that a tick needs, combined: state s = [z2-hat; eta+], output [x-hat; alpha; v-hat] = Os s + Oy y."""
+def _spec(scenario: Scenario, i: int, node: Node, step: Step, c: float, units: Array) -> NodeSpec:
+    """Everything that a tick needs, combined: state s = [z2-hat; eta+], output [x-hat; alpha; v-hat] = Os s + Oy y.
+
+    ``units``: of the states that the node was designed in; x-hat and the neighbours' are in the file's.
+    """
     options: Options = scenario.options
     s, bounds, sensor = node.separated, node.bounds, scenario.nodes[i]
     q, k = s.W1.shape[0], s.A22.shape[0]
     width = bounds.width / options.kappa  # delta of (16), which starts at its equilibrium and stays there
-    to_x = np.hstack([s.V2, np.zeros((s.V2.shape[0], q))]), s.U1 @ np.linalg.solve(s.C11, s.W1)
+    U1, V2 = to_state(s.U1, units), to_state(s.V2, units)
+    to_x = np.hstack([V2, np.zeros((V2.shape[0], q))]), U1 @ np.linalg.solve(s.C11, s.W1)
     to_alpha = np.hstack([np.zeros((q, k)), np.diag(1 / width)]), -s.W1 / width[:, None]
     Fplus = np.linalg.pinv(sensor.noise.channel)
     to_v = -Fplus @ sensor.C @ to_x[0], Fplus - Fplus @ sensor.C @ to_x[1]
@@ -155,7 +167,7 @@ def _spec(scenario: Scenario, i: int, node: Node, step: Step, c: float) -> NodeS
     matrices = {
         "Phi": step.Phi,
         "Gamma": step.Gamma,
-        "K": c * step.K @ (s.V2 @ node.gains.Tu).T,
+        "K": c * step.K @ from_state((s.V2 @ node.gains.Tu).T, units),
         "bias": step.bias,
         "Os": np.vstack([to_x[0], to_alpha[0], to_v[0]]),
         "Oy": np.vstack([to_x[1], to_alpha[1], to_v[1]]),
