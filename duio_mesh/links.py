@@ -34,7 +34,7 @@ class Links:
         self.observer = tape.follow(make_observer(spec))
         edges: list[tuple[str, str, Ready | None]] = [(keys.edge(i, j), f"edge {i} -> {j}", (i, j)) for j in spec.tells]
         self.told = mesh.speak(edges, drop=spec.tick > 0)  # in real time nobody waits for who does not listen
-        self.credit = mesh.speak([(keys.credit(i), f"{i} -> plant", (i, "plant"))])
+        self.credit = mesh.speak([(keys.credit(i), f"{i} -> plant", None)])
         self.trace = mesh.speak(
             [(keys.trace(i), f"{i} -> recorder", (i, "recorder") if spec.kept else None)], drop=not spec.kept
         )
@@ -50,7 +50,7 @@ class Links:
             return
         times = 1 if spec.on_loss == "stop" else PATIENCE
         self.lockstep = lockstep = Lockstep(mesh, spec.deadline, report, times)
-        self._plant = Line(mesh, keys.plant(i), f"plant -> {i}", "plant", ("plant", i), window)
+        self._plant = Line(mesh, keys.plant(i), f"plant -> {i}", "plant", None, window)
         self._plant.patient = spec.outside
         self._sample = partial(lockstep.take, self._plant)
         self.heard = {
@@ -63,8 +63,16 @@ class Links:
     def begin(self) -> int:
         """Begin with everybody else, at step 0. Raises RunError when somebody is not there."""
         self.mesh.meet()
+        self._greet_the_plant()
+        self.mesh.meet()
         self._report("ready")
         return 0
+
+    def _greet_the_plant(self) -> None:
+        """Let the plant begin, as far as it is for us. After the neighbours: one that needs nobody may soon be gone."""
+        i = self._spec.id
+        self.mesh.announce(("plant", i))
+        self.mesh.expect(f"{i} -> plant", (i, "plant"))
 
     def faults(self) -> dict[str, int]:
         """How many frames met which fault."""
@@ -119,6 +127,7 @@ class Links:
         """
         spec, lockstep = self._spec, self.lockstep
         assert isinstance(lockstep, Lockstep)  # noqa: S101  (nobody comes back in real time)
+        self._greet_the_plant()
         self.mesh.unanswered(RETURN)  # who does not answer is gone itself
         self._report("ready")
         admission = ask(lockstep, self._plant, self.credit, spec.id, spec.incarnation)

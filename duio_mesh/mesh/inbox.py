@@ -20,7 +20,7 @@ BEFORE = (-1, 0)
 class Link(Source):
     """One incoming link of a realtime node."""
 
-    def __init__(self, mesh: Mesh, key: str, name: str, who: str, ready: Ready, inbox: Inbox) -> None:
+    def __init__(self, mesh: Mesh, key: str, name: str, who: str, ready: Ready | None, inbox: Inbox) -> None:
         super().__init__(name, who, Decoder(mesh.keys.run, who))
         self.waiting: dict[At, tuple[float, Array]] = {}
         """Frames that are not due yet, and when they arrived."""

@@ -75,7 +75,9 @@ class Line(Source):
 
     patient = False  # its sender itself says when it has waited too long, and may end early by an empty frame
 
-    def __init__(self, mesh: Mesh, key: str, name: str, who: str, ready: Ready, window: int, room: int = 0) -> None:
+    def __init__(
+        self, mesh: Mesh, key: str, name: str, who: str, ready: Ready | None, window: int, room: int = 0
+    ) -> None:
         """``window``: steps that the sender may be ahead of us. ``room``: frames that may wait; 0: as below.
 
         A neighbour that hears us is never more than a round ahead, because its next round needs our present one. One

@@ -80,7 +80,7 @@ class Realtime:
         self._mesh, self._late, self._note, self._patience = mesh, late, note, spec.deadline
         self._tell = Spoiler(spec, told)
         self._inbox, keys, i = Inbox(), mesh.keys, spec.id
-        self._plant = Link(mesh, keys.plant(i), f"plant -> {i}", "plant", ("plant", i), self._inbox)
+        self._plant = Link(mesh, keys.plant(i), f"plant -> {i}", "plant", None, self._inbox)
         self._heard = {
             j: Link(mesh, keys.edge(j, i), f"edge {j} -> {i}", f"node-{j}", (j, i), self._inbox)
             for j in sorted(spec.hears)

@@ -211,8 +211,12 @@ class Mesh:
             control = zenoh.CongestionControl.DROP if drop else zenoh.CongestionControl.BLOCK
             publishers.append(self._session.declare_publisher(key, congestion_control=control, express=False))
             if ready:
-                self._meeting[name] = self._session.declare_publisher(self.keys.ready(*ready))
+                self.expect(name, ready)
         return Outlet(Encoder(self.keys.run, self.who), publishers)
+
+    def expect(self, name: str, ready: Ready) -> None:
+        """Let the start barrier wait for somebody at the other end of this link."""
+        self._meeting[name] = self._session.declare_publisher(self.keys.ready(*ready))
 
     def watch(self, changed: Callable[[Member, bool], None] | None = None) -> None:
         """Announce this process and notice when a directly linked one comes or goes (``changed(member, alive)``).

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from duio_mesh import load_scenario, simulate, synthesise
 from duio_mesh.errors import DesignError
-from duio_mesh.synthesis.uio import decouple
+from duio_mesh.synthesis.uio import decouple, decouple_node
 
 
 def random_pair(seed: int, n: int, p: int, r: int):
@@ -95,13 +95,18 @@ HYDRAULIC = {
 
 def designed(folder, plant, C, observer, **timing):
     """The design of one node on its own."""
+    return synthesise(load_scenario(written(folder, plant, C, observer, **timing)))
+
+
+def written(folder, plant, C, observer, **timing):
+    """Its topology file."""
     plant = plant if "disturbance" in plant else {"disturbance": TWO, **plant}
     nodes, run = {"1": {"C": C}}, {"steps": 10, "convergence": {"rms_below": 1}, **timing}
     document = {"name": "units", "plant": plant, "observer": observer, "nodes": nodes, "run": run}
     document["graph"] = {"edges": []}
     path = folder / "units.yaml"
     path.write_text(json.dumps(document).replace('"1":', "1:"), "utf-8")
-    return synthesise(load_scenario(path))
+    return path
 
 
 DISCRETE = [{"method": "lmi"}, {"method": "augmented"}, {"method": "admm", "fusion": "finite_time"}]
@@ -113,18 +118,20 @@ def test_an_input_in_large_units_does_not_hide_the_others(tmp_path, observer):
     assert made.certificate["spectral_radius"] == pytest.approx(0, abs=1e-12)
 
 
-@pytest.mark.parametrize("observer", DISCRETE[:2])
-def test_an_input_that_cannot_be_told_from_another_is_refused(tmp_path, observer):
+def test_an_input_that_cannot_be_told_from_another_is_refused(tmp_path):
+    """In the file's units; ``synthesise`` goes on to even ones, in which it can."""
     words = r"node 1: it is not told disturbance 1.* state x2.*Choose units of the states"
+    path = written(tmp_path, {**LARGE, **HIDING}, [[1, 0, 0], [0, 1, 0]], DISCRETE[0])
     with pytest.raises(DesignError, match=words):
-        designed(tmp_path, {**LARGE, **HIDING}, [[1, 0, 0], [0, 1, 0]], observer)
+        decouple_node(load_scenario(path), 1)
 
 
-def test_two_inputs_are_told_apart_in_even_units(tmp_path):
-    made = designed(tmp_path, {**LARGE, **HIDING}, [[1, 0, 0], [0, 1, 0]], DISCRETE[2])
+@pytest.mark.parametrize("observer", DISCRETE)
+def test_two_inputs_are_told_apart_in_even_units(tmp_path, observer):
+    made = designed(tmp_path, {**LARGE, **HIDING}, [[1, 0, 0], [0, 1, 0]], observer)
     assert made.certificate["state_units"][0] > 2**20 * made.certificate["state_units"][1]
     trace = simulate(made)
-    np.testing.assert_allclose(trace.xhat[0, 5:, :2], trace.x[5:, :2], rtol=1e-12)
+    np.testing.assert_allclose(trace.xhat[0, 5:, :2], trace.x[5:, :2], rtol=1e-9)
     np.testing.assert_allclose(trace.xhat[0, -1, 2], trace.x[-1, 2], atol=2 * 0.5**9)
 
 
