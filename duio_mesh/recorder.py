@@ -6,6 +6,7 @@ from the processes' own journals at the end, so a finished recording is complete
 
 from __future__ import annotations
 
+import ctypes
 import os
 import signal
 import time
@@ -23,6 +24,8 @@ from duio_mesh.observers.watch import COLUMNS
 from duio_mesh.process import Report, main
 from duio_mesh.report.recording import Recording
 from duio_mesh.spec import RecorderSpec
+
+_M_MMAP_THRESHOLD, LARGE = -3, 1 << 17  # malloc.h; bytes from which a block is a mapping of its own
 
 RATE_PERIOD = 0.5  # seconds between two values of the rates at first, and between writes that nobody watches
 RATES = 128  # values after which the rates are said half as often: a long run shall not fill memory with them
@@ -50,6 +53,8 @@ class Rates:
 
 def run(spec: RecorderSpec, report: Report) -> None:
     """Record until SIGTERM (with ``kept`` also until nobody is left), then complete and close the recording."""
+    with suppress(AttributeError):  # another C library than glibc, which raises this limit as soon as a larger block is
+        ctypes.CDLL(None).mallopt(_M_MMAP_THRESHOLD, LARGE)  # freed; later ones lie in the heap and do not go back
     finishing = SimpleQueue[None]()
     changes = SimpleQueue[tuple[str, bool]]()
     writing = Ledger(spec) if spec.kept else nullcontext()
