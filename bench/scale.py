@@ -26,7 +26,7 @@ from typing import NamedTuple
 import rings
 from interleave import Contenders, Results, interleaved, machine, table
 from page import Page
-from processes import PROC, family, memories
+from processes import family, memories
 
 from duio_mesh import launcher
 from duio_mesh.launcher import Progress
@@ -57,7 +57,7 @@ def pin(count: int) -> None:
     for who, pid in family().items():
         if who.startswith("node-"):
             core = cores[(int(who.removeprefix("node-")) - 1) * len(cores) // count]
-            for thread in (PROC / str(pid) / "task").iterdir():
+            for thread in Path(f"/proc/{pid}/task").iterdir():
                 os.sched_setaffinity(int(thread.name), {core})
 
 
