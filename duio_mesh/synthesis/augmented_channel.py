@@ -97,7 +97,7 @@ def _attempt(
     A, B, C = N_S + K @ heard, np.eye(n * N)[:, own], heard[own]
     try:
         K_c, Q, R, S = compensator(A, B, C)
-    except linalg.LinAlgError:  # this draw is not controllable and observable from c
+    except (linalg.LinAlgError, ValueError):  # this draw is not controllable and observable from c, or hardly
         return np.inf, gains
     gains[c] = Gains(gains[c].F, K_c, Q, R, S)
     Phi = np.block([[A + B @ K_c @ C, B @ Q], [R @ C, S]])

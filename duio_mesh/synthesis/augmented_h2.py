@@ -139,5 +139,8 @@ def mild_filter(C: Array, A: Array) -> Array:
     if not seen.size:
         return np.zeros((len(A), len(C)))
     r = 100.0 * np.eye(len(C))
-    X = linalg.solve_discrete_are(A_d.T, C_d.T, np.eye(len(A_d)), r)
+    try:
+        X = linalg.solve_discrete_are(A_d.T, C_d.T, np.eye(len(A_d)), r)
+    except (linalg.LinAlgError, ValueError):  # "Reordering of (A, B) failed": then the search starts without
+        return np.zeros((len(A), len(C)))
     return np.asarray(seen @ A_d @ X @ C_d.T @ np.linalg.inv(C_d @ X @ C_d.T + r))

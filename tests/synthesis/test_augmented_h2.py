@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from scipy import linalg, optimize
 from duio_mesh import load_scenario, synthesise
 from duio_mesh.errors import DesignError
 from duio_mesh.geometry.stability import spectral_radius
+from duio_mesh.scenario.model import OpenLoop
 from duio_mesh.synthesis import synthesise as synthesise_aloud
 from duio_mesh.synthesis.augmented_error import ErrorSystem, Network, Sensor
 from duio_mesh.synthesis.augmented_h2 import Cost, h2_gains, mild_filter
@@ -238,3 +240,17 @@ def test_too_large_is_said_before_the_search(monkeypatch):
     monkeypatch.setattr("duio_mesh.synthesis.augmented.LARGEST", 8)
     with pytest.raises(DesignError, match=r"gains exist .* has \d+ rows and is dense; .*method: lmi"):
         synthesise(load("example9"))
+
+
+def test_a_riccati_equation_that_scipy_gives_up_on_costs_a_start_only(monkeypatch):
+    def refuse(*_, **__):
+        raise ValueError("Reordering of (A, B) failed because the transformed matrix pair is too far from Schur form")
+
+    def quiet(**overrides):
+        scenario = load("example9", **overrides)  # without the plant's own LQR gain
+        return replace(scenario, plant=replace(scenario.plant, control=OpenLoop(((),) * scenario.plant.B.shape[1])))
+
+    monkeypatch.setattr(linalg, "solve_discrete_are", refuse)
+    assert synthesise(quiet()).certificate["spectral_radius"] < 1
+    with pytest.raises(DesignError, match="no compensator at one of the nodes"):
+        synthesise(quiet(observer__gains="lqg"))
