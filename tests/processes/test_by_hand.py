@@ -19,14 +19,14 @@ pytestmark = [pytest.mark.mesh, pytest.mark.usefixtures("nothing_left")]
 
 
 SLOW = """
-import time
 from duio_mesh import node
 from duio_mesh.mesh import Mesh
 
 meet = Mesh.meet
 
 def late(mesh, timeout=None):
-    time.sleep(1.5)  # everything is declared; the others could be done by now
+    with mesh._news:  # everything is declared; is anybody done and gone before we look for them?
+        mesh._news.wait_for(lambda: mesh._seen - mesh._here, 1.5)
     meet(mesh, timeout)
 
 Mesh.meet = late
